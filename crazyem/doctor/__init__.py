@@ -1,4 +1,4 @@
-"""The doctor: what is wrong with a recording, found from its numbers; one file a check, and the lossless repairs."""
+"""The doctor finds faults of a recording from its numbers: one file for each check, and the lossless repairs."""
 
 import importlib
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ __all__ = ["CHECKS", "Check", "Finding", "Fix", "Grade", "examine"]
 class Check:
     """A check: module `crazyem.doctor.<module>` with `check(recording: Recording) -> list[Finding]`.
 
-    Checks read and never change the recording, skip what is not in it, and cost at most a few seconds and some copies
-    of one signal for a recording of 600 000 samples.
+    A check never changes the recording and skips signals that are missing. For 600 000 samples it takes at most a few
+    seconds and the memory of a few copies of one signal.
     """
 
     module: str
@@ -24,7 +24,7 @@ class Check:
 
     def run(self, recording: Recording) -> list[Finding]:
         module = importlib.import_module(f"crazyem.doctor.{self.module}")
-        with np.errstate(all="ignore"):  # hostile values may overflow; what comes out compares false
+        with np.errstate(all="ignore"):  # extreme values may overflow; comparisons with the result are false
             return list(module.check(recording))
 
 
@@ -50,6 +50,6 @@ CHECKS: tuple[Check, ...] = (
 
 
 def examine(recording: Recording) -> tuple[Finding, ...]:
-    """Everything odd about a recording, what its reader noticed first, the worst first within each."""
+    """All findings about a recording: those of its reader, then those of the checks, the worst first within each."""
     found = [finding for check in CHECKS for finding in check.run(recording)]
     return tuple(f for group in (recording.findings, found) for f in sorted(group, key=lambda f: f.grade.rank))

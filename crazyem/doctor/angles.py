@@ -28,11 +28,12 @@ Array = NDArray[np.float64]
 
 DEGREES = 180.0 / math.pi
 ANGLE_UNITS = {"degrees": DEGREES, "converted": 1.0 / DEGREES}
-LEAST_ANGLE_RMS = math.radians(0.1)  # rms of an angle, below which nothing is said of it
-LEAST_CORRELATION = 0.8  # correlation that an angle must have with one of the quaternion's to be judged
+LEAST_ANGLE_RMS = math.radians(0.1)  # rad rms; an angle that moves less is not judged
+LEAST_CORRELATION = 0.8  # least correlation of an angle with an angle of the quaternion for a judgement
 LARGEST_ANGLES = (math.radians(80.0), math.radians(65.0))  # roll and pitch up to which Euler angles are judged
 ANGLE_NAMES = ("roll", "pitch", "yaw")
-# ways to read four numbers as an attitude: name -> (how far-fetched, columns in the order x y z w, conjugated)
+# Ways to read four numbers as an attitude: name -> (cost: the lower, the simpler; columns in the order x y z w;
+# whether conjugated).
 READINGS: dict[str, tuple[int, tuple[int, ...], bool]] = {
     "x y z w, body to world": (0, (0, 1, 2, 3), False),
     "w x y z, body to world": (1, (1, 2, 3, 0), False),
@@ -53,7 +54,7 @@ def check(recording: Recording) -> list[Finding]:
             wrong.add(name)
     sound = {name: array for name, array in attitudes.items() if name not in wrong}
     for name, array in measurements(recording, "euler").items():
-        # of the same origin first: another one may have another heading, and lags
+        # a quaternion of the same origin first: one of another origin may have another heading, and a lag
         ordered = sorted(sound, key=lambda other: origin_of(other) != origin_of(name))
         for other in ordered:
             finding, told = _euler(name, array, other, sound[other])
@@ -72,7 +73,7 @@ def reading(array: SignalArray, name: str) -> SignalArray:
 
 
 def _quaternion(name: str, array: SignalArray, recording: Recording) -> Finding | None:
-    """Which reading makes a quaternion turn as the gyro does, and stand upright by the accelerometer?"""
+    """Finding if another reading of a quaternion than the declared one agrees with the gyro and with gravity."""
     turns = _by_rate(array, recording)
     upright = _by_gravity(array, recording)
     declared = next(iter(READINGS))
@@ -81,9 +82,9 @@ def _quaternion(name: str, array: SignalArray, recording: Recording) -> Finding 
     if turns and turns[0] != declared:
         evidence |= turns[1]
         if upright and upright[turns[0]] < 0.9 and upright[declared] > 0.95:
-            return None  # the gyro may be wrong, gravity is not
+            return None  # gravity supports the declared reading; the gyro may be wrong
     elif not turns and upright and upright[declared] < 0.5:
-        # too little turning: only the order can be told, since gravity does not see the heading
+        # too little rotation: gravity does not depend on the heading, so it shows the order only
         chosen = max(upright, key=lambda reading_name: (round(upright[reading_name], 3), -READINGS[reading_name][0]))
         if upright[chosen] < 0.9:
             return None
@@ -101,7 +102,7 @@ def _quaternion(name: str, array: SignalArray, recording: Recording) -> Finding 
 
 
 def _by_rate(array: SignalArray, recording: Recording) -> tuple[str, dict[str, float]] | None:
-    """The reading whose derivative is the gyro, if that can be told."""
+    """The reading whose derivative agrees with the gyro, and evidence; None if the data do not decide."""
     for gyro in measurements(recording, "body_rate").values():
         grid = grid_of(array, gyro)
         if grid.size == 0:
@@ -109,7 +110,7 @@ def _by_rate(array: SignalArray, recording: Recording) -> tuple[str, dict[str, f
         window = Window(max(0.24, width_for(array, gyro)))
         smooth = {key: window.mean(rate_of_attitude(track(reading(array, key), grid))) for key in READINGS}
         raw = track(gyro, grid)
-        # a conjugate turns about nearly the same axes the other way: one of each order is enough to find the lag
+        # a conjugate turns the other way about nearly the same axes: one reading of each order suffices for the lag
         lags = [delay(one, window.mean(raw)) for one in list(smooth.values())[:2]]
         good = [one for one in lags if one is not None and not one.at_edge]
         if not good:
@@ -135,7 +136,7 @@ def _by_rate(array: SignalArray, recording: Recording) -> tuple[str, dict[str, f
 
 
 def _by_gravity(array: SignalArray, recording: Recording) -> dict[str, float] | None:
-    """For each reading the cosine between the mean specific force, turned to the world, and up."""
+    """For each reading, the cosine between up and the mean specific force in the world frame."""
     for force in measurements(recording, "specific_force").values():
         grid = grid_of(array, force)
         if grid.size == 0:
@@ -154,7 +155,7 @@ def _by_gravity(array: SignalArray, recording: Recording) -> dict[str, float] | 
 
 
 def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -> tuple[Finding | None, bool]:
-    """A finding, if any, and whether anything could be told."""
+    """A finding, if any, and whether the data allow a judgement."""
     grid = grid_of(array, quaternion)
     if grid.size == 0:
         return None, False
@@ -170,7 +171,7 @@ def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -
         return None, False
     block = blocks(grid.time[rows])
     straight_x, straight_y = _unit_variance(x.value[rows]), _unit_variance(y.value[rows])
-    # an angle that hardly moves is noise: it speaks neither for nor against
+    # an angle that hardly moves is noise, so it is no evidence
     excited = x.value[rows].std(axis=0) >= LEAST_ANGLE_RMS
     alike = np.abs(straight_x.T @ straight_y) / rows.size
     told: NDArray[np.bool_] = np.any(alike > LEAST_CORRELATION, axis=0)
@@ -181,7 +182,7 @@ def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -
     if choice is None or choice.explained[choice.best] < 0.8:
         return None, False
     if choice.denied and choice.name:
-        # each angle must bear it out by itself: noise has a sign, too
+        # each angle must agree by itself: noise has a sign, too
         match = (ways[choice.name][1] * straight_y).mean(axis=0)
         if not (match[told] > LEAST_CORRELATION).all():
             return None, False
@@ -200,7 +201,7 @@ def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -
 def _euler_finding(
     name: str, head: str, choice: Choice, parts: Mapping[str, Slope | None], evidence: dict[str, float]
 ) -> Finding | None:
-    """What the best reading of Euler angles says: an inverted sign, another order, another unit; None: all is well."""
+    """Finding by the best reading of Euler angles: an inverted sign, another order or unit; None if there is none."""
     if choice.denied:
         what = choice.name.removeprefix("as declared ")
         factor = axes.sign_factor(what, ANGLE_NAMES) if choice.name else None
@@ -224,7 +225,7 @@ def _euler_finding(
 
 
 def _upright(attitude: Track, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The longest stretch in which roll and pitch are far from where Euler angles jump."""
+    """(m,) True in the longest stretch in which roll and pitch are far from the jumps of Euler angles."""
     angles = np.abs(euler_from_quaternion(attitude.value))
     far = (angles[:, 0] < LARGEST_ANGLES[0]) & (angles[:, 1] < LARGEST_ANGLES[1]) | ~attitude.valid
     edges = np.flatnonzero(np.diff(np.concatenate([[False], far, [False]]).astype(np.int8)))
@@ -241,7 +242,7 @@ def _unit_variance(value: Array) -> Array:
 
 
 def _orders(x: Array, told: NDArray[np.bool_]) -> dict[str, tuple[int, Array]]:
-    """Signs of the angles, and the order yaw, pitch, roll."""
+    """Hypotheses of signs, and of the order yaw, pitch, roll; components that are not `told` are zero."""
     out = {}
     for key, (cost, value) in axes.signed("as declared", x, ANGLE_NAMES).items():
         if cost <= 2 or [part.lstrip("-") for part in key.split(" ")[-3:]] == ["yaw,", "pitch,", "roll"]:
@@ -250,7 +251,7 @@ def _orders(x: Array, told: NDArray[np.bool_]) -> dict[str, tuple[int, Array]]:
 
 
 def _unit_of(slopes: list[float]) -> str:
-    """Key of `ANGLE_UNITS` that the slopes point to, "" for radians or where they disagree."""
+    """Key of `ANGLE_UNITS` nearest to the slopes; "" for radians, or if no unit is near."""
     if not slopes or min(slopes) <= 0.0:
         return ""
     middle = math.exp(float(np.mean(np.log(slopes))))
@@ -271,7 +272,7 @@ def _unwrapped(quaternion: SignalArray) -> SignalArray:
 
 
 def _continuous_angles(array: SignalArray) -> SignalArray:
-    """The array without jumps of a whole turn, whatever its unit: a turn is what the range of yaw suggests."""
+    """The array without jumps of a whole turn, in any unit: the range of yaw suggests the size of a turn."""
     largest = float(np.abs(array.value).max())
     if largest <= 1.001 * math.pi / DEGREES:
         turn = 2.0 * math.pi / DEGREES

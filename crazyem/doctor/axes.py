@@ -1,4 +1,4 @@
-"""Signed axes as hypotheses, and slopes as units or scale faults: what the comparing checks share."""
+"""Hypotheses of signed axes, and slopes read as units or scale faults; several checks share these functions."""
 
 import itertools
 import math
@@ -12,16 +12,17 @@ from crazyem.doctor.regression import Slope
 
 Array = NDArray[np.float64]
 
-SCALE_TOLERANCE = 0.02  # sensors and filters in good order differ by so much
-FEWEST_SCALE_BLOCKS = 5.0  # blocks (of 1.5 s or more) of motion that a scale must have been seen over
+SCALE_TOLERANCE = 0.02  # relative; sensors and filters in good order differ by this much
+FEWEST_SCALE_BLOCKS = 5.0  # least number of blocks (of 1.5 s or more) of motion for a scale fault
 _AXIS_NAMES = "xyz"
-_FACTOR_TOLERANCE = math.log(1.2)  # how far a slope may be from a known factor
+_FACTOR_TOLERANCE = math.log(1.2)  # largest |log| of a slope over a known factor
 
 
 def signed(label: str, vector: Array, names: Sequence[str] = _AXIS_NAMES) -> dict[str, tuple[int, Array]]:
-    """All 48 signed orders of the components of (n, 3): name -> (how far-fetched, values); the plain one first.
+    """All 48 signed orders of the components of (n, 3): name -> (cost, values); the unchanged order is first.
 
-    A sign costs 1 (all three together: 2), another order 2 more. Names: "body", "body x, -y, z", "body y, x, z".
+    The cost is lower for simpler hypotheses: 1 for a sign (2 for all three), 2 more for another order. Names: "body",
+    "body x, -y, z", "body y, x, z".
     """
     out: dict[str, tuple[int, Array]] = {}
     for order in itertools.permutations(range(3)):
@@ -43,7 +44,7 @@ def sign_factor(name: str, names: Sequence[str] = _AXIS_NAMES) -> tuple[float, .
 
 
 def known_factor(found: Slope, known: Mapping[str, float]) -> tuple[str, float] | None:
-    """The known factor that a slope is (within 20 %), None if 1 or anything else."""
+    """Name and value of the known factor within 20 % of a slope; None if there is none."""
     if found.value <= 0.0:
         return None
     for name, factor in known.items():
@@ -54,14 +55,14 @@ def known_factor(found: Slope, known: Mapping[str, float]) -> tuple[str, float] 
 
 @dataclass(frozen=True, slots=True)
 class ScaleFault:
-    """A scale that is not 1. `text` names factors and intervals; `repair` are the factors to multiply with."""
+    """A scale that is not 1. `text` names the scales and intervals; `repair` has the factors to multiply with."""
 
     text: str
     repair: tuple[float, ...]
 
 
 def scale_fault(whole: Slope | None, single: Sequence[Slope | None], least: float) -> ScaleFault | None:
-    """A scale fault of all components or of some, if one is at least `least` from 1 for certain, else None.
+    """A scale fault of all or some components; None if no slope is at least `least` from 1 with certainty.
 
     Args:
         whole: slope of all components together.

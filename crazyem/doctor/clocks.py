@@ -14,26 +14,26 @@ from crazyem.recordings.stamps import RESTART_SECONDS
 
 Column = NDArray[np.float64]
 
-# Counters that overflow: name -> seconds until they start again
+# Counters that overflow: name -> seconds from zero to the overflow
 CLOCK_WRAPS: dict[str, float] = {
     "24 bits of milliseconds": 2.0**24 * 1e-3,
     "32 bits of milliseconds": 2.0**32 * 1e-3,
     "32 bits of microseconds": 2.0**32 * 1e-6,
     "16 bits of milliseconds": 2.0**16 * 1e-3,
 }
-RATE_DEVIATION = 0.002  # relative deviation of the rate worth a word
-WRONG_RATE_DEVIATION = 0.1  # from which a claimed rate is wrong
+RATE_DEVIATION = 0.002  # relative deviation of the rate from which it is reported
+WRONG_RATE_DEVIATION = 0.1  # the same from which a claimed rate is wrong
 _USUAL_RATES = (
     1, 2, 4, 5, 8, 10, 12.5, 20, 25, 30, 40, 50, 60, 100, 120, 125, 200, 240, 250, 300, 400, 500, 800, 1000, 2000,
 )  # Hz  # fmt: skip
-CLOCK_JUMP = 0.3  # s by which two clocks may part from one packet to the next: a radio link stalls for less
+CLOCK_JUMP = 0.3  # s; least jump between two clocks from one packet to the next: a radio link stalls for less
 
 
 def check(recording: Recording) -> list[Finding]:
     """Findings per stream, and for the drone's clock against the host's."""
     found = []
     rates: dict[tuple[float, float], list[str]] = {}
-    drifts: dict[str, tuple[int, list[Finding]]] = {}  # of each clock, from the stream that tells most
+    drifts: dict[str, tuple[int, list[Finding]]] = {}  # of each clock, from the stream with most arrival times
     several = len({array.clock for array in recording.signals.values()}) > 1
     for stream in streams(recording):
         if stream.time.size < 2:
@@ -140,7 +140,7 @@ def _twice(stream: Stream, rows: NDArray[np.int64]) -> Finding:
 def _rate(
     stream: Stream, metadata: Mapping[str, Mapping[str, str]], rates: dict[tuple[float, float], list[str]]
 ) -> None:
-    """Note a stream whose rate is not what was asked for, or not quite a round number."""
+    """Add to `rates` a stream whose rate differs from the claimed rate, or slightly from a usual one."""
     time = stream.time
     if (np.diff(time) < 0).any():
         return
@@ -160,7 +160,7 @@ def _rate(
 
 
 def _claimed(metadata: Mapping[str, Mapping[str, str]], stream: str, real: float) -> float | None:
-    """The rate that the source claims for the stream, or for the whole table if the stream comes near it."""
+    """The rate [Hz] that the source claims for the stream, or for the whole table if it is within 40 % of `real`."""
     claims = metadata.get("claims", {})
     for key, near in ((f"{stream}.rate_hz", math.inf), ("rate_hz", 0.4)):
         try:
@@ -188,7 +188,7 @@ def _rate_finding(nominal: float, real: float, names: list[str]) -> Finding:
 
 
 def _arrivals(stream: Stream) -> tuple[Column, Column, NDArray[np.int64]] | None:
-    """Stamps, arrivals less stamps, and rows, where the host stamped arrivals; None where there is nothing to see."""
+    """Stamps, arrival times less stamps, and rows of the samples with arrival times; None if they cannot be used."""
     array = stream.arrays[0]
     known = np.isfinite(array.host_time)
     if stream.clock == "host" or stream.commanded or known.sum() < 100:
@@ -201,12 +201,12 @@ def _arrivals(stream: Stream) -> tuple[Column, Column, NDArray[np.int64]] | None
 
 
 def _jumps(stream: Stream, time: Column, offset: Column, rows: NDArray[np.int64]) -> Iterator[Finding]:
-    # a late packet leaves the line and comes back; a jump stays: compare the medians of what is around
+    # the delay of a late packet passes, a jump of the clock stays: so samples before and after are compared
     candidates = np.flatnonzero(np.abs(np.diff(offset)) > CLOCK_JUMP)
     sizes = []
     for i in candidates[:1000]:
         before, after = offset[max(0, i - 20) : i + 1], offset[i + 1 : i + 41]
-        # packets that queued up arrive late, never early: the earliest arrivals show the clocks
+        # packets in a queue arrive late, never early: so the earliest arrivals show the clocks
         size = float(after.min() - before.min())
         if abs(size) > CLOCK_JUMP:
             sizes.append((int(i), size))
@@ -230,7 +230,7 @@ def _jumps(stream: Stream, time: Column, offset: Column, rows: NDArray[np.int64]
 
 
 def _drift(time: Column, offset: Column, *, several: bool) -> Iterator[Finding]:
-    """Slope of the earliest arrivals of each of twenty spans: delays only ever add."""
+    """Drift from a line through the earliest arrival of each of twenty spans, because delays are never negative."""
     duration = float(time[-1] - time[0])
     if duration < 5.0 or np.abs(np.diff(offset)).max() > CLOCK_JUMP:
         return

@@ -1,4 +1,4 @@
-"""The lag between two tracks of one motion: found to a fraction of a grid step, whatever the units and axes are."""
+"""The lag between two tracks of one motion, to a fraction of a grid step and for any units and axes."""
 
 import math
 from dataclasses import dataclass
@@ -10,21 +10,21 @@ from crazyem.doctor.kinematics import GRID_STEP, Track
 
 Array = NDArray[np.float64]
 
-LARGEST_LAG = 0.3  # s, lags looked for on either side
+LARGEST_LAG = 0.3  # s, largest lag of the search, on either side
 COARSE_LAG_STEP = 3  # grid steps between lags tried at first
-MOST_CORRELATION_ROWS = 4000  # of the grid that a correlation is made of, at most
-JACKKNIFE_REACH = 6  # grid steps about a lag within which it may move when a block is left out
-FEWEST_CORRELATION_ROWS = 45  # and at least
+MOST_CORRELATION_ROWS = 4000  # most rows of the grid in a correlation
+JACKKNIFE_REACH = 6  # grid steps by which a lag may move, on either side, when a block is left out
+FEWEST_CORRELATION_ROWS = 45  # fewest rows of the grid in a correlation
 
 
 @dataclass(frozen=True, slots=True)
 class Delay:
-    """How much later the second track shows what the first one shows.
+    """Lag of the second track behind the first.
 
     Attributes:
         value: s; positive where the second is late.
-        explained: share of the second's variance that the first, so much later, explains.
-        at_edge: the best lag is at the end of the range: there is no maximum within.
+        explained: share of the variance of the second track that the first explains at this lag.
+        at_edge: the best lag is at the end of the range, so there is no maximum inside.
     """
 
     value: float
@@ -33,18 +33,18 @@ class Delay:
 
 
 def delay(first: Track, second: Track, *, reach: float = LARGEST_LAG, mixed: bool = True) -> Delay | None:
-    """Lag of `second` behind `first`, (m, c) each; None if they share too little.
+    """Lag of `second` behind `first`, (m, c) each; None if they have too few valid rows in common.
 
     Args:
-        first, second: smoothed alike, on one grid.
-        reach: s.
-        mixed: explain each component of the second by all of the first (any axes, signs and units); else by the same
-            component only, with a free factor.
+        first, second: on one grid, smoothed with the same window.
+        reach: s, largest lag on either side.
+        mixed: explain each component of the second by all components of the first (any axes, signs and units); else
+            by the same component with a free factor.
     """
     most = round(reach / GRID_STEP)
     steps = np.arange(-most, most + 1)
     curve = np.full(steps.size, np.nan)
-    # what was smoothed has no peak narrower than the window: every third lag finds it, its neighbours refine it
+    # a smoothed signal has no peak narrower than the window: every third lag finds the peak, its neighbours refine it
     for k in range(0, steps.size, COARSE_LAG_STEP):
         curve[k] = _explained(first, second, int(steps[k]), mixed)
     if not np.isfinite(curve).any():
@@ -61,7 +61,7 @@ def delay(first: Track, second: Track, *, reach: float = LARGEST_LAG, mixed: boo
 
 
 def _explained(first: Track, second: Track, steps: int, mixed: bool) -> float:
-    """Share of the variance of second(t) that first(t - steps) explains; NaN with too little in common."""
+    """Share of the variance of second(t) that first(t - steps) explains; NaN with too few common rows."""
     m = len(first.value)
     a, b = max(0, -steps), max(0, steps)
     n = m - abs(steps)
@@ -89,10 +89,10 @@ def _explained(first: Track, second: Track, steps: int, mixed: bool) -> float:
 
 
 def spread(first: Track, second: Track, found: Delay, block_rows: int) -> tuple[float, int]:
-    """Standard error [s] of a lag, and of how many blocks: the peak found again with each block left out.
+    """Standard error [s] of a lag by leaving out one block at a time (jackknife), and the number of blocks.
 
     Args:
-        first, second, found: what `delay` was given and gave.
+        first, second, found: arguments and result of `delay`.
         block_rows: grid steps of a block.
     """
     middle = round(found.value / GRID_STEP)
@@ -131,7 +131,7 @@ def _share(sums: Array) -> Array:
     n = np.maximum(sums[:, 0], 1.0)
     mx, my = sums[:, 1] / n, sums[:, 2] / n
     sxx, sxy, syy = sums[:, 3] / n - mx * mx, sums[:, 4] / n - mx * my, sums[:, 5] / n - my * my
-    # what is left of sums that cancel is nothing
+    # a variance this small is the rounding error of sums that cancel
     still = (sxx <= 1e-12 * (sums[:, 3] / n)) | (syy <= 1e-12 * (sums[:, 5] / n))
     got = np.where(still, 0.0, sxy**2 / np.where(still, 1.0, sxx)).sum(axis=1)
     whole = np.where(still, 0.0, syy).sum(axis=1)
@@ -139,7 +139,7 @@ def _share(sums: Array) -> Array:
 
 
 def _peak(curve: Array) -> float:
-    """Place of the maximum between samples, by a parabola."""
+    """Position of the maximum in samples, from a parabola through three samples."""
     top = int(np.argmax(curve))
     if top in (0, curve.size - 1):
         return float(top)

@@ -1,10 +1,10 @@
 """Flights that are in a folder twice: whole or trimmed copies, with other clocks, units or formats.
 
-A fingerprint is made of turning points: instants at which a measured channel is highest or lowest among its neighbours.
-Three of them in a row give two spans of time and the ratio of two changes of value; rounded, these are a number that no
-shift of the clock and no unit, sign or offset of the channel changes, and that its noise makes rare. Two flights that
-share many such numbers, all at one distance in time, are one flight; two flights along one trajectory share some, at
-all distances. Setpoints are left out: they are equal in different flights.
+A fingerprint is a set of hashes from turning points: instants at which a measured channel is highest or lowest among
+its neighbours. Three of them in a row give two time spans and the ratio of two changes of value. Rounded, these make a
+hash. It does not depend on the clock's offset or on the unit, sign or offset of the channel, and noise makes it rare.
+Copies of one flight share many hashes at one time offset. Two flights along one trajectory share some, at many time
+offsets. Setpoints are left out: they are equal in different flights.
 """
 
 import math
@@ -23,15 +23,15 @@ from crazyem.recordings.recording import Recording, SignalArray
 Array = NDArray[np.float64]
 Hashes = NDArray[np.uint32]
 
-TURNING_POINT_NEIGHBOURS = 6  # samples on each side that a turning point stands out from
+TURNING_POINT_NEIGHBOURS = 6  # samples on each side that a turning point is compared with
 SPAN_STEP = 0.005  # s, rounding of the spans
-RATIO_STEP = 0.1  # rounding of the logarithm of the ratio; there are two roundings, half a step apart
-HASHES_PER_SECOND = 40.0  # numbers kept, of those there are, chosen by their own value so that copies choose alike
-MOST_HASHES = 60_000  # numbers kept of a very long flight
-LARGE_GROUP = 16  # files that share a number, from which on not every pair of them is looked at
-TIME_TOLERANCE = 0.02  # s within which distances in time agree
-FEWEST_COMMON_HASHES = 20  # numbers in common at one distance
-LEAST_COMMON_SHARE = 0.15  # of the numbers in the common stretch that must be in common
+RATIO_STEP = 0.1  # rounding of the logarithm of the ratio; each ratio is rounded twice, half a step apart
+HASHES_PER_SECOND = 40.0  # most hashes kept per second; their value decides, so copies keep the same ones
+MOST_HASHES = 60_000  # most hashes kept of one flight
+LARGE_GROUP = 16  # entries with one hash; in larger groups not every pair is compared
+TIME_TOLERANCE = 0.02  # s, largest difference of time offsets that agree
+FEWEST_COMMON_HASHES = 20  # least number of common hashes at one time offset
+LEAST_COMMON_SHARE = 0.15  # least share of common hashes in the common stretch
 _CHANNELS = 12
 _CHANNELS_LARGE = 5  # for recordings with more than _LARGE_CHANNEL_ROWS rows a channel
 _LARGE_CHANNEL_ROWS = 150_000
@@ -44,13 +44,13 @@ _IGNORED_SIGNALS = ("setpoint", "sp_", "ctrltarget", "ref")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fingerprint:
-    """What a flight is recognised by.
+    """Hashes by which a flight is recognised.
 
     Attributes:
         path: of the recording.
         start_s, end_s: of its time axis.
-        hashes: (n,) numbers, see above.
-        times: (n,) s at which they are.
+        hashes: (n,), see the module.
+        times: (n,) s, the time of each hash.
     """
 
     path: str
@@ -82,11 +82,11 @@ class Duplicate:
 
     Attributes:
         first, second: paths, the longer recording first.
-        overlap_s: how long the common stretch is.
+        overlap_s: length of the common stretch.
         offset_s: time in the second recording less time in the first, at one instant.
-        share_first, share_second: of each recording that is common.
+        share_first, share_second: common share of each recording.
         start_s, end_s: of the common stretch, on the time axis of the first.
-        matches: numbers in common.
+        matches: number of common hashes.
     """
 
     first: str
@@ -104,7 +104,7 @@ class Duplicate:
         return asdict(self)
 
     def finding(self) -> Finding:
-        """For people, on the time axis of the first recording."""
+        """The duplicate as a finding, on the time axis of the first recording."""
         if self.share_first > 0.98 and self.share_second > 0.98:
             what = f"{self.second} is the same flight as {self.first}"
         elif self.share_second > 0.98:
@@ -124,7 +124,7 @@ class Duplicate:
 
 
 def fingerprint(recording: Recording) -> Fingerprint:
-    """What the recording is recognised by; without noisy measurements it is empty and nothing is ever found."""
+    """The fingerprint of a recording; empty without noisy measurements, and then it matches nothing."""
     hashes, times = [np.zeros(0, np.uint32)], [np.zeros(0)]
     for time, value in _channels(recording):
         h, t = _numbers(time, value)
@@ -146,9 +146,9 @@ def fingerprint(recording: Recording) -> Fingerprint:
 
 
 def find_duplicates(fingerprints: Sequence[Fingerprint] | Iterable[Fingerprint]) -> list[Duplicate]:
-    """Pairs of recordings of one flight, the most in common first.
+    """Pairs of recordings of one flight, the longest common stretch first.
 
-    Of several copies each is paired with the longest; the pairs among the rest, which follow, are left out.
+    Each of several copies is paired with the longest one only.
     """
     prints = sorted(fingerprints, key=lambda p: (p.start_s - p.end_s, p.path))
     votes = _votes(prints)
@@ -165,7 +165,7 @@ def find_duplicates(fingerprints: Sequence[Fingerprint] | Iterable[Fingerprint])
 
 
 def _channels(recording: Recording) -> list[tuple[Array, Array]]:
-    """Times (n,) and values (n,) of the channels to look at, measurements of the vocabulary first."""
+    """Times (n,) and values (n,) of the channels to use, known measurements first."""
     names = sorted(recording.signals, key=lambda name: _rank(name, recording.signals[name]))
     chosen: list[tuple[Array, Array]] = []
     for name in names:
@@ -192,7 +192,7 @@ def _rank(name: str, array: SignalArray) -> tuple[int, str]:
 
 
 def _numbers(time: Array, value: Array) -> tuple[Hashes, Array]:
-    """The numbers (n,) of one channel and their times (n,)."""
+    """The hashes (n,) of one channel and their times (n,)."""
     fresh = np.append(True, value[1:] != value[:-1])  # held values are one sample
     time, value = time[fresh], value[fresh]
     if value.size < 4 * TURNING_POINT_NEIGHBOURS:
@@ -200,7 +200,7 @@ def _numbers(time: Array, value: Array) -> tuple[Hashes, Array]:
     size = 2 * TURNING_POINT_NEIGHBOURS + 1
     turning = (value == maximum_filter1d(value, size)) | (value == minimum_filter1d(value, size))
     turning[:TURNING_POINT_NEIGHBOURS] = turning[-TURNING_POINT_NEIGHBOURS:] = (
-        False  # what stands out at an end may be nothing in a longer copy
+        False  # an extreme at an end may be none in a longer copy
     )
     t, v = time[turning], value[turning]
     if t.size < 3:
@@ -219,7 +219,7 @@ def _numbers(time: Array, value: Array) -> tuple[Hashes, Array]:
 
 
 def _mixed(*words: NDArray[np.uint64]) -> Hashes:
-    """A well mixed 32-bit number of some words (multiplications by odd constants; overflow is meant)."""
+    """A 32-bit hash of some words, by multiplications by odd constants; the overflow is intended."""
     state = np.full(words[0].shape, 0x9E3779B97F4A7C15, np.uint64)
     for word in words:
         state = (state ^ word) * np.uint64(0xBF58476D1CE4E5B9)
@@ -230,7 +230,7 @@ def _mixed(*words: NDArray[np.uint64]) -> Hashes:
 
 
 def _votes(prints: Sequence[Fingerprint]) -> dict[tuple[int, int], Array]:
-    """For each pair of prints with enough numbers in common, the distances in time (n,) between them."""
+    """For each pair of fingerprints with enough common hashes, the time offsets (n,) of these."""
     if not prints:
         return {}
     owner = np.repeat(np.arange(len(prints)), [p.hashes.size for p in prints])
@@ -242,14 +242,14 @@ def _votes(prints: Sequence[Fingerprint]) -> dict[tuple[int, int], Array]:
     start = np.repeat(edges, np.diff(np.append(edges, hashes.size)))
     rows = np.arange(hashes.size)
     firsts, seconds = [], []
-    for back in range(1, LARGE_GROUP):  # each with the ones before it in its group
+    for back in range(1, LARGE_GROUP):  # pair each entry with those before it in its group
         other = rows - back
         inside = other >= start
         if not inside.any():
             break
         firsts.append(other[inside])
         seconds.append(rows[inside])
-    far = rows - start >= LARGE_GROUP  # and of large groups with its first
+    far = rows - start >= LARGE_GROUP  # in large groups, with the first
     firsts.append(start[far])
     seconds.append(rows[far])
     a, b = np.concatenate(firsts), np.concatenate(seconds)
@@ -269,7 +269,7 @@ def _votes(prints: Sequence[Fingerprint]) -> dict[tuple[int, int], Array]:
 
 
 def _judge(first: Fingerprint, second: Fingerprint, distances: Array) -> Duplicate | None:
-    """Whether so many numbers are in common at one distance that it is one flight."""
+    """The duplicate if enough hashes agree at one time offset, else None."""
     upper = np.searchsorted(distances, distances + TIME_TOLERANCE, "right")
     counts = upper - np.arange(distances.size)
     best = int(np.argmax(counts))
@@ -283,7 +283,7 @@ def _judge(first: Fingerprint, second: Fingerprint, distances: Array) -> Duplica
     matched, seen = _matches(first, second, offset)
     if matched.size < FEWEST_COMMON_HASHES:
         return None
-    # the stretch reaches to the ends of the files unless the numbers in common end long before
+    # the stretch reaches to the ends of the files, unless the common hashes end long before
     reach = 5.0 * max(float(np.median(np.diff(np.sort(matched)))), 0.2)
     low = start if matched.min() - start < max(reach, 2.0) else float(matched.min())
     high = end if end - matched.max() < max(reach, 2.0) else float(matched.max())
@@ -305,11 +305,11 @@ def _judge(first: Fingerprint, second: Fingerprint, distances: Array) -> Duplica
 
 
 def _matches(first: Fingerprint, second: Fingerprint, offset: float) -> tuple[Array, Array]:
-    """Times in the first of numbers that the second has at that distance, and of all numbers of the poorer print."""
+    """Times in the first of common hashes at this offset, and of all hashes of the print with fewer per second."""
     keys = [p.hashes.astype(np.int64) for p in (first, second)]
     place = np.lexsort((second.times, keys[1]))
     hashes, times = keys[1][place], second.times[place] - offset
-    # one search for both: numbers far apart, times within a number
+    # one search for hash and time: hashes are integers, times are scaled to fractions
     scale = 1.0 / (4.0 * (abs(first.end_s - first.start_s) + abs(second.end_s - second.start_s) + abs(offset) + 1.0))
     middle = 0.5 * (first.start_s + first.end_s)
     sorted_keys = hashes + scale * (times - middle)

@@ -1,4 +1,4 @@
-"""How hard a recording flew while it was in the air."""
+"""Extremes of the motion of a recording while the drone was in the air."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -16,7 +16,7 @@ _SPEED_SPAN = 0.1  # s over which position is differenced where there is no velo
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """Extremes of the airborne part; None where the recording cannot say. SI, world z up, body FLU."""
+    """Extremes of the airborne part; None where a signal is missing. SI, world z up, body FLU."""
 
     airborne_s: float
     judged_by: tuple[str, ...]
@@ -46,7 +46,7 @@ class Envelope:
 
 
 def envelope(recording: Recording, air: Airtime) -> Envelope:
-    """Extremes of the airborne part, of samples as they were measured: one wild sample shows."""
+    """Extremes of the airborne part, of samples as measured: one outlier is enough to set an extreme."""
     found: dict[str, Any] = {}
     speed = _speed(recording, air)
     if speed is not None:
@@ -78,7 +78,7 @@ def _upright(q: Array) -> Array:
     return 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2) / np.where(square > 0.0, square, 1.0)
 
 
-# Signal -> what its samples in the air (n, c) say; angles where there is no quaternion.
+# Signal -> extremes of its samples in the air (n, c); Euler angles count where there is no quaternion.
 _EXTREMES: dict[str, Callable[[Array], dict[str, Any]]] = {
     "attitude": lambda q: _tilt("attitude", _upright(q)),
     "euler": lambda angles: _tilt("euler", np.cos(angles[:, 0]) * np.cos(angles[:, 1])),
@@ -114,7 +114,7 @@ def _sound(recording: Recording, name: str) -> tuple[Array, Array] | None:
 
 
 def _speed(recording: Recording, air: Airtime) -> tuple[str, Array] | None:
-    """Where velocity comes from, and (n, 3) m/s in the air."""
+    """The signal that gives the velocity, and (n, 3) m/s in the air."""
     velocity = inside_of(recording, "velocity", air)
     if velocity is not None:
         return "velocity", velocity

@@ -1,11 +1,11 @@
-"""What a flight's noise lets its commands say: prewhitened regressions of acceleration on commanded force and torque.
+"""Information of a flight's commands: prewhitened regressions of acceleration on commanded force and torque.
 
-Acceleration over a step between two samples is compared with the mean thrust and torque over it, after rotor lag and
-delay. Its residual is whitened by an autoregression fitted to it (generalised least squares), so that the standard
-deviations are those of an efficient estimator under the noise that this flight really has (the Cramer-Rao bound of the
-linearised model), and widened for what correlation is left (Newey and West 1987). What noise in sampled commands costs
-is counted as in crazyem.estimation.inflation: commands of a 500 Hz loop, logged slower, are partly noise that never
-acted. Priors on lag, delay and offsets are the estimator's; the parameter in question has none.
+The acceleration over a step between two samples is compared with the mean thrust and torque over this step, after
+rotor lag and delay. An autoregression whitens the residual (generalised least squares). So the standard deviations are
+those of an efficient estimator under the noise of this flight (the Cramer-Rao bound of the linearised model). They are
+widened for the remaining correlation (Newey and West 1987). Noise in sampled commands is counted as in
+crazyem.estimation.inflation: commands of a 500 Hz loop, logged slower, are partly noise that never acted. Priors of
+lag, delay and offsets are those of the estimator; the parameter whose error is computed has no prior.
 """
 
 import math
@@ -26,22 +26,22 @@ Array = NDArray[np.float64]
 
 FINEST_STEP = 4e-3  # s; faster streams are averaged into steps of 5 ms
 AVERAGED_STEP = 5e-3
-LONGEST_STEP = 0.05  # s; a longer hole between two samples parts two stretches
-MOST_STEPS = 6_000  # more are sampled in blocks, and the information scaled
+LONGEST_STEP = 0.05  # s; a longer gap between two samples separates two stretches
+MOST_STEPS = 6_000  # of more steps a sample of blocks is used, and the information is scaled
 BLOCK_STEPS = 1_000
 DELAY, DELAY_SD = 3.5e-3, 2e-3  # s, prior of the estimator for commands
-SPEED_DELAY_SD = 10e-3  # s, and for measured rotor speeds
+SPEED_DELAY_SD = 10e-3  # s, the same for measured rotor speeds
 LAG_SD = 0.7  # of the logarithm
 INERTIA_SD = 0.5
 TRIM_SD = 0.05  # shift of the centre of mass over the arm: prior of the torque offsets
 _THIRD_DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])
-# of one iteration: logarithms of inertia and lag, delay [ms], offsets as far as they like
+# largest move in one iteration: logarithms of inertia and lag, delay [ms]; offsets are not limited
 _LONGEST_MOVE = np.array([0.4, 0.4, 0.4, 0.4, 5.0, np.inf, np.inf, np.inf])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps:
-    """Steps between samples: stretches of nodes without holes; share says which part of the flight they are."""
+    """Steps between samples: stretches of nodes without gaps; `share` is their share of the flight."""
 
     nodes: tuple[Array, ...]  # (k,) s each
     values: tuple[Array, ...]  # (k, c) each
@@ -60,7 +60,7 @@ def steps_of(time: Array, value: Array, air: Airtime) -> Steps | None:
     if time.size < 4 * AUTOREGRESSION_ORDER:
         return None
     time, value = thinned(time, value)
-    # a row that repeats the one before was not measured (a slower stream put onto a faster grid)
+    # a row equal to the one before was not measured (a slower stream on a faster grid)
     keep = np.append(True, (np.diff(time) > 0.0) & (value[1:] != value[:-1]).any(axis=1))
     time, value = time[keep], value[keep]
     period = float(np.median(np.diff(time))) if time.size > 1 else math.nan
@@ -105,16 +105,16 @@ def lagged(
 
 
 def predictor_of(inputs: Inputs, steps: Steps) -> Array:
-    """How the next command follows from those before, in these stretches: see crazyem.physics.lag."""
+    """Predictor of the next command from those before it, in these stretches: see crazyem.physics.lag."""
     if not inputs.lagged:
         return hold_predictor()
     return fit_predictor(inputs.wrench[np.concatenate([_indices(inputs, nodes) for nodes in steps.nodes])])
 
 
 def rotation_fit(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | None:
-    """As `rotation_fit_once`, its sd widened where quarters of the flight disagree by more than their own (Birge 1932).
+    """`rotation_fit_once`, with sd widened where quarters of the flight scatter by more than their sd (Birge 1932).
 
-    A model that does not hold (torque of the air, another lag in every turn) finds another inertia in every quarter.
+    A wrong model (aerodynamic torque, a lag that varies) gives another inertia in every quarter.
     """
     fit = rotation_fit_once(inputs, steps, vehicle)
     if fit is None:
@@ -126,7 +126,7 @@ def rotation_fit(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | None:
 
 
 def quarters(steps: Steps) -> list[Steps]:
-    """The flight in four parts of as many samples each."""
+    """The flight in four parts with equal numbers of samples."""
     edges = np.quantile(np.concatenate(steps.nodes), [0.0, 0.25, 0.5, 0.75, 1.0])
     parts = []
     for low, high in pairwise(edges):
@@ -178,7 +178,7 @@ def rotation_fit_once(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | N
         own[i] = 0.0
         covariance = np.linalg.pinv(system.matrix / share + np.diag(own), hermitian=True)
         sd[i] = math.sqrt(max(covariance[i, i], 0.0)) * system.inflation(np.asarray(covariance[:, i], float))
-        # the larger of what it costs with everything else known and of what it costs with everything else free
+        # the larger of the biases with all other parameters known and with all other parameters free
         together = abs(float(covariance[i] @ noise)) / share
         bias[i] = max(together, min(float(noise[i] / max(system.matrix[i, i], 1e-300)), 1.0) if noise[i] > 0.0 else 0.0)
     return Fit(theta, sd, bias)
@@ -194,7 +194,7 @@ def rates_of_attitude(time: Array, attitude: Array) -> tuple[Array, Array]:
 
 
 class _RotationSystem:
-    """Normal equations of the rotation at one point, whitened axis by axis."""
+    """Normal equations of the rotation at one parameter point, whitened for each axis."""
 
     def __init__(self, response: list[Array], rows: list[tuple[Array, Array, Array]], theta: Array, tau: float) -> None:
         self.matrix, self.score, self.count = np.zeros((8, 8)), np.zeros(8), 0
@@ -229,7 +229,7 @@ class _RotationSystem:
             self.count = max(self.count, z.size)
 
     def inflation(self, weights: Array) -> float:
-        """Factor by which correlation left in the scores widens the error of `weights @ score`; never below 1."""
+        """Factor by which the remaining correlation of the scores widens the error of `weights @ score`; at least 1."""
         scaled = [terms @ weights[:, None] for terms in self.terms]
         plain = sum(float(np.sum(s**2)) for s in scaled)
         wide = sum(float(long_run(s)[0]) for s in scaled)
@@ -237,7 +237,7 @@ class _RotationSystem:
 
 
 def _command_noise_score(inputs: Inputs, steps: Steps, system: _RotationSystem, theta: Array, *, timed: bool) -> Array:
-    """(8,) what noise in the samples of the commands adds to the score: made noise of that size, sent the same way."""
+    """(8,) contribution of noise in the command samples to the score, from simulated noise of the same variance."""
     score = np.zeros(8)
     if not timed:
         return score
@@ -273,7 +273,7 @@ def _command_noise_score(inputs: Inputs, steps: Steps, system: _RotationSystem, 
 
 
 def _white_variance(command: Array, rate: Array, *, rate_variance: float) -> float:
-    """Variance of what in command samples (n,) does not persist: see crazyem.estimation.inflation, same arithmetic."""
+    """Variance of white noise in command samples (n,), computed as in crazyem.estimation.inflation."""
     du, dw = np.convolve(command, _THIRD_DIFFERENCE, "valid"), np.convolve(rate, _THIRD_DIFFERENCE, "valid")
     power = float(dw @ dw)
     gain = float(du @ dw) / power if power > 0.0 else 0.0
@@ -295,7 +295,7 @@ def _first_covariance(parts: list[Array]) -> float:
 
 
 def thinned(time: Array, value: Array) -> tuple[Array, Array]:
-    """A stream (n,), (n, c) as it is, or as means over bins of 5 ms (those at least half full) if it is faster."""
+    """A stream (n,), (n, c): unchanged, or if it is faster as means over bins of 5 ms that are at least half full."""
     if time.size < 2 or np.median(np.diff(time)) >= FINEST_STEP:
         return time, value
     bins = np.floor((time - time[0]) / AVERAGED_STEP).astype(np.int64)

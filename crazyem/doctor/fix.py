@@ -1,6 +1,6 @@
-"""Lossless repairs of a recording, one finding at a time, each believed only if the check that found it is then silent.
+"""Lossless repairs of a recording, one finding at a time; a repair is kept only if its check then reports no fault.
 
-A repair makes a new recording and says in its metadata, section "fixes", what was done, in enough detail to undo it.
+A repair makes a new recording. The section "fixes" of its metadata says what was done, in enough detail to undo it.
 """
 
 import json
@@ -21,23 +21,23 @@ from crazyem.recordings.recording import Recording, SignalArray
 Array = NDArray[np.float64]
 Signals = dict[str, SignalArray]
 
-# Times first, since what compares signals needs them; then units, since a rate in deg/s reads as impossible samples in
-# rad/s and those must not be thrown away; then frames, which need an attitude in order; what is left is marked.
+# Times come first, because comparisons of signals need them. Then units: a rate in deg/s looks like impossible samples
+# in rad/s, and these must not be marked as missing. Then frames, which need a correct attitude. Marking comes last.
 FIX_ORDER = ("unwrap", "sort", "shift", "scale", "world_to_body", "mark")
 _TIME_FIXES = ("unwrap", "sort", "shift")
-_ATTITUDE_REACH = 0.1  # s between an attitude and what it rotates
+_ATTITUDE_REACH = 0.1  # s, largest time between an attitude and the sample that it rotates
 
 
 def apply_fixes(recording: Recording, findings: Iterable[Finding]) -> tuple[Recording, tuple[Finding, ...]]:
-    """Repair what can be repaired without loss.
+    """Apply the lossless repairs of findings.
 
-    A finding of a check of the doctor is looked for again before and after its repair: one that another repair has
-    settled already is left alone, and a repair after which it is still found is taken back. Findings of readers cannot
-    be looked for again; their repairs are applied as they are.
+    For a finding of the doctor, its check runs again before and after the repair. If another repair has already removed
+    the finding, nothing is done. If the finding is still there after its own repair, the repair is dropped. Findings of
+    readers cannot be checked again; their repairs are applied directly.
 
     Args:
         recording: never changed.
-        findings: of `examine`, or some of them; those without a fix are passed over.
+        findings: of `examine`, or some of them; those without a fix are skipped.
 
     Returns: the repaired recording (the same if nothing was applied), and the findings whose repairs are in it.
     """
@@ -59,13 +59,13 @@ def apply_fixes(recording: Recording, findings: Iterable[Finding]) -> tuple[Reco
 
 
 def _place(finding: Finding) -> int:
-    """When a repair's turn comes: rows that a reader named first, while they are still where it found them."""
+    """Rank of a repair in the order of application: repairs of readers first, while their row numbers still hold."""
     assert finding.fix is not None
     return FIX_ORDER.index(finding.fix.kind) if _checkable(finding) else -1
 
 
 def repair(recording: Recording, finding: Finding) -> Recording:
-    """The recording with one finding's fix applied and noted, not verified."""
+    """The recording with the fix of one finding applied and recorded in the metadata, not verified."""
     fix = finding.fix
     assert fix is not None
     signals: Signals = dict(recording.signals)
@@ -77,7 +77,7 @@ def repair(recording: Recording, finding: Finding) -> Recording:
 
 
 def _again(recording: Recording, finding: Finding) -> Finding | None:
-    """The finding as it is made now: None if its check no longer makes it, itself if it cannot be made again."""
+    """The finding by a new run of its check: None if it is gone, the finding itself if no check can run again."""
     if not _checkable(finding):
         return finding
     check = next(c for c in CHECKS if c.module == finding.check)
@@ -142,7 +142,7 @@ def _mark(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
 
 
 def _world_to_body(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
-    """Rotated by the attitude at its stamps; what has no attitude within 0.1 s becomes missing."""
+    """Rotate samples by the attitude at their stamps; samples without an attitude within 0.1 s become missing."""
     attitude = sound_samples(recording.signals["attitude"])
     if attitude is None:
         return array
@@ -176,7 +176,7 @@ def _on_rows(old: Array, new: Array, rows: NDArray[np.int64] | None) -> Array:
 
 
 def _attitude_at(stamps: Array, attitude: Array, time: Array) -> Array:
-    """Unit quaternions (n, 4) at times (n,), between neighbours; NaN where none is near."""
+    """Unit quaternions (n, 4) at times (n,), interpolated between neighbours; NaN where none is near."""
     mixed = np.column_stack([np.interp(time, stamps, column) for column in continuous(attitude).T])
     mixed /= np.linalg.norm(mixed, axis=1, keepdims=True)
     after = np.minimum(np.searchsorted(stamps, time), stamps.size - 1)
@@ -190,7 +190,7 @@ def _attitude_at(stamps: Array, attitude: Array, time: Array) -> Array:
 
 
 def _separate_streams(signals: Signals, before: Mapping[str, SignalArray], fix: Fix) -> Signals:
-    """Signals that no longer share the stamps of their stream get a stream of their own."""
+    """Give signals whose stamps now differ from those of their stream a stream of their own."""
     changed = set(fix.signals)
     for stream in {before[name].stream for name in changed}:
         members = {name for name, array in before.items() if array.stream == stream}
@@ -201,7 +201,7 @@ def _separate_streams(signals: Signals, before: Mapping[str, SignalArray], fix: 
 
 
 def _merged(signals: Signals) -> Signals:
-    """Processing order by time, what was equal in time as it was before."""
+    """Signals with the processing order by time; samples with equal times keep their order."""
     arrays = list(signals.values())
     time = np.concatenate([a.time for a in arrays])
     order = np.concatenate([a.order for a in arrays])

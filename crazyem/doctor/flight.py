@@ -1,7 +1,7 @@
-"""Check: was there a flight at all, how did it begin and end, did the drone tip over or crash.
+"""Check: was there a flight, how did it begin and end, did the drone tip over or crash.
 
-A landing is rough by nature: 50 to 120 m/s^2 and 20 rad/s at the touch of the ground are normal. So a crash is told by
-what a landing does not have: a fast fall or slide into the ground, a drone that ends on its side, rotors cut at height.
+A landing is rough: 50 to 120 m/s^2 and 20 rad/s at touchdown are normal. So signs of a crash are: a fast fall or slide
+into the ground, a drone that lies on its side at the end, rotors that stop at height.
 """
 
 import math
@@ -20,14 +20,14 @@ from crazyem.recordings.thrust import is_rotorcraft, kind_objection
 UPSET_TILT = 90.0  # degrees of tilt
 LYING_TILT = 60.0  # degrees of tilt at rest
 HARD_LANDING_SPEED = 1.5  # m/s into the ground; a controller lands at up to 0.8, a drop from 10 cm ends at 1.4
-IMPOSSIBLE_SPEED = 50.0  # m/s: a wrong position, not a fall
-APPROACH_SECONDS = 0.05  # s before the ground, over which that speed is taken
-CARRIED_HEIGHT = 0.3  # m of height that a drone changes whose rotors do not turn: by hand
-DROP_HEIGHT = 0.4  # m above ground at which rotors stop
+IMPOSSIBLE_SPEED = 50.0  # m/s; a larger speed comes from a wrong position, not from a fall
+APPROACH_SECONDS = 0.05  # s before touchdown, over which the speed is computed
+CARRIED_HEIGHT = 0.3  # m; a larger change of height without turning rotors means that somebody carried the drone
+DROP_HEIGHT = 0.4  # m above ground; rotors that stop higher than this mean a drop
 
 
 def check(recording: Recording) -> list[Finding]:
-    """No flight, a recording that is cut, upsets and crashes."""
+    """Findings about a missing flight, a recording that begins or ends in the air, upsets and crashes."""
     flight = airtime(recording)
     kind = _kind(recording)
     if not flight.known:
@@ -45,7 +45,7 @@ def check(recording: Recording) -> list[Finding]:
 
 
 def _kind(recording: Recording) -> list[Finding]:
-    """Another kind of vehicle than the models are of."""
+    """Finding if the models do not describe this kind of vehicle."""
     why = kind_objection(recording)
     if not why:
         return []
@@ -65,7 +65,7 @@ def _no_flight(flight: Airtime) -> Finding:
 
 
 def _course(flight: Airtime) -> Iterator[Finding]:
-    """Where a recording begins or ends in the air, or holds several flights: the times in the air."""
+    """Times in the air, if a recording begins or ends in the air or holds several flights."""
     at_work = flight.airborne if flight.by_height_alone else flight.lifting
     starts, ends = at_work[0][0] <= flight.begin, at_work[-1][1] >= flight.end
     count = len(flight.flown)
@@ -112,7 +112,7 @@ def _upsets(flight: Airtime, tilt: tuple[NDArray[np.float64], NDArray[np.float64
         return
     time, angle = tilt
     rows = inside(time, flight.airborne) & (angle > UPSET_TILT)
-    # one wild sample is a bad number, not a roll-over
+    # one or two samples are bad numbers, not a roll-over
     for first, last in runs(rows):
         if last - first < 3:
             rows[first:last] = False
@@ -128,7 +128,7 @@ def _upsets(flight: Airtime, tilt: tuple[NDArray[np.float64], NDArray[np.float64
 def _lying(
     recording: Recording, flight: Airtime, tilt: tuple[NDArray[np.float64], NDArray[np.float64]] | None
 ) -> list[Finding]:
-    """On its side or back after the rotors stopped: from the attitude, or from the direction of gravity at rest."""
+    """Finding if the drone lies on its side or back after the rotors stopped, by the attitude or by gravity at rest."""
     end = flight.lifting[-1][1]
     angles = []
     if tilt is not None:
@@ -143,7 +143,7 @@ def _lying(
         angles.append((time[rest], angle[rest], "specific force"))
     for time, angle, words in angles:
         after = angle[time > end + 0.3]
-        # the rest must last: a fifth of a second and half of what is left
+        # the drone must stay tilted: at least ten samples, and the second half of the remaining time
         if after.size >= 10 and float(np.median(after)) > LYING_TILT:
             last = float(np.median(after[after.size // 2 :]))
             if last < LYING_TILT:
@@ -184,7 +184,7 @@ def _path(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 
 def _impacts(recording: Recording, flight: Airtime) -> Iterator[Finding]:
-    """Speed of the approach to the ground, over the last tenth of a second before it."""
+    """Hard impacts: speed of the approach over the last `APPROACH_SECONDS` before the ground."""
     path = _path(recording)
     if path is None or not math.isfinite(flight.ground):
         return
@@ -232,7 +232,7 @@ def _drops(recording: Recording, flight: Airtime) -> list[Finding]:
         height = float(position[i, 2]) - flight.ground
         before = position[(time > end - 0.2) & (time <= end)]
         if before.shape[0] < 3 or not (before[1:] != before[:-1]).any():
-            continue  # the log stood still: nobody knows when they stopped
+            continue  # the log stood still, so the time at which the rotors stopped is unknown
         later = position[(time > end) & (time < end + 1.0), 2]
         fell = height - (float(later.min()) - flight.ground) if later.size else 0.0
         if height > DROP_HEIGHT and fell > 0.5 * height:

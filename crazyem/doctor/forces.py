@@ -26,11 +26,11 @@ from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
-FORCE_WINDOW = 0.3  # s: an accelerometer in flight is loud
-LEAST_FORCE_RMS = 0.25  # m/s^2 rms along an axis, below which frames and signs are not told
+FORCE_WINDOW = 0.3  # s, smoothing window: an accelerometer in flight is noisy
+LEAST_FORCE_RMS = 0.25  # m/s^2 rms along an axis; with less motion, frames and signs are not judged
 LEAST_EXPLAINED_SHARE = 0.5  # share of the variance about the mean that a hypothesis must explain
 SCALE_FAULT = 0.05
-VELOCITY_TOLERANCE = 0.04  # how far a velocity may be from its position's derivative to be trusted
+VELOCITY_TOLERANCE = 0.04  # relative; largest error of the scale of a velocity that counts as the derivative
 HOVER_SPEED_RMS = 0.03  # m/s rms
 _WITHOUT_GRAVITY = "it is the acceleration in the {} frame without gravity, not the specific force"
 _AS_ACCELERATION = "Read it as acceleration; add gravity to get the specific force."
@@ -65,7 +65,11 @@ def check(recording: Recording) -> list[Finding]:
 
 
 def _moving(recording: Recording) -> SignalArray | None:
-    """The first velocity that is the derivative of a position; else the first position, else the first velocity."""
+    """The signal that gives the acceleration.
+
+    A single velocity without a position, or the first velocity that is the derivative of a position; else the first
+    position, else the first velocity.
+    """
     velocities = measurements(recording, "velocity")
     positions = measurements(recording, "position")
     if len(velocities) == 1 and not positions:
@@ -77,7 +81,7 @@ def _moving(recording: Recording) -> SignalArray | None:
 
 
 def _derived(velocity: SignalArray, position: SignalArray) -> bool:
-    """True if the slope of a velocity against a position's derivative is 1 within `VELOCITY_TOLERANCE`."""
+    """True if the slope of a velocity against the derivative of a position is 1 within `VELOCITY_TOLERANCE`."""
     grid = grid_of(velocity, position)
     window = Window(max(FORCE_WINDOW, width_for(velocity, position)))
     x, y = window.mean(difference(track(position, grid))), window.mean(track(velocity, grid))
@@ -135,13 +139,13 @@ def _specific_force(name: str, array: SignalArray, recording: Recording, attitud
 
 
 def _level(seen: Comparison) -> tuple[float, float]:
-    """Mean of the measurement along the predicted mean, as a factor of it; and its standard error."""
+    """Mean of the measurement along the predicted mean, divided by the size of that mean; and its standard error."""
     size = float(np.linalg.norm(seen.predicted))
     return float(seen.mean @ seen.predicted) / size**2, float(np.linalg.norm(seen.mean_error)) / size
 
 
 def _by_weight(name: str, array: SignalArray, attitudes: list[Pose]) -> list[Finding]:
-    """Without motion to compare: over a flight that begins and ends at rest the mean force is the weight."""
+    """Findings without motion to compare: over a flight that begins and ends at rest the mean force is the weight."""
     for pose in attitudes[:1]:
         grid = grid_of(array, pose.array)
         window = Window(FORCE_WINDOW)
@@ -158,7 +162,7 @@ def _by_weight(name: str, array: SignalArray, attitudes: list[Pose]) -> list[Fin
 def _judge_level(
     name: str, level: float, error: float, seen: Comparison | None, *, signed: bool = True
 ) -> list[Finding]:
-    """What the level of gravity in a specific force says of its unit, gravity, sign and scale."""
+    """Findings about unit, gravity, sign and scale of a specific force, from its mean over the weight (`level`)."""
     evidence = {"gravity_level": level, "gravity_level_error": error, **(seen.evidence() if seen else {})}
     head = f"The mean of {name} is {level:.4g} times the weight it must carry: "
     advice = "Correct its unit where it is read."
@@ -186,7 +190,7 @@ def _unit_said(unit: str) -> str:
 
 
 def _scale(name: str, level: float, error: float, seen: Comparison, evidence: Mapping[str, float]) -> Finding:
-    """A level off by some per cent: a scale, or a bias along the vertical; the moving part tells, where it can."""
+    """Finding about a level wrong by some per cent: a scale fault or a vertical bias, by the changes of the force."""
     whole = seen.whole
     interval = f"{level:.3f} ({level - 2 * error:.3f} to {level + 2 * error:.3f})"
     text = f"The mean of {name} is {interval} times the weight it must carry"
@@ -210,7 +214,7 @@ def _scale(name: str, level: float, error: float, seen: Comparison, evidence: Ma
 def _structure(name: str, seen: Comparison) -> Finding:
     known = _FORCE_MISREAD
     fix: Fix | None = Fix("world_to_body", (name,))
-    if abs(_level(seen)[0]) < 0.3 * abs(seen.whole.value if seen.whole else 1.0):  # of a force it would be gravity
+    if abs(_level(seen)[0]) < 0.3 * abs(seen.whole.value if seen.whole else 1.0):  # a force has gravity in its mean
         known = known | {"world": (_WITHOUT_GRAVITY.format("world"), "Read it as acceleration.")}
         fix = None
     return misread("forces", name, seen, known, noun="specific force", what="", fix=fix)

@@ -1,4 +1,4 @@
-"""Check: channels that never change though they should, or stick for a while in flight; columns that are not in use."""
+"""Check: channels that stay constant in flight, always or for a while, although they should change; unused columns."""
 
 import math
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ from crazyem.recordings.thrust import UNKNOWN_VOLTAGE_ERROR, flat_voltage
 
 Flags = NDArray[np.bool_]
 
-# Shortest stretch without any change that counts as stuck [s]: noise moves inertial sensors at every sample, while a
-# pose in millimetres, or a quaternion in 0.16 degrees, may stay for a while in a hover.
+# Shortest stretch without any change that counts as stuck [s]. Noise changes inertial sensors at every sample; a pose
+# in steps of a millimetre, or a quaternion in steps of 0.16 degrees, may stay constant for a while in a hover.
 SHORTEST_STILLNESS: dict[str, float] = {
     "body_rate": 0.2,
     "specific_force": 0.2,
@@ -29,18 +29,18 @@ SHORTEST_STILLNESS: dict[str, float] = {
     "euler": 0.3,
 }
 FEWEST_STILL_SAMPLES = 10
-STILLNESS_RATIO = 6.0  # times the longest of 99 % of the channel's own still stretches
+STILLNESS_RATIO = 6.0  # least length of a stuck stretch, over the 99th percentile of the channel's other still ones
 _INERTIAL_SIGNALS = frozenset({"body_rate", "specific_force", "acceleration"})
 _LEAST_MOTION = {
     "position": 0.03,
     "velocity": 0.15,
     "attitude": 0.03,
     "euler": 0.03,
-}  # m, m/s, rad meanwhile, as others say
+}  # m, m/s, rad; least motion during the stretch by other signals
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Whole signals and single components that stand still in flight; constant columns, in one finding."""
+    """Findings about signals and single components that stay constant in flight, and one about unused columns."""
     flight = airtime(recording)
     found = []
     stuck: list[_Stuck] = []
@@ -68,7 +68,7 @@ def check(recording: Recording) -> list[Finding]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stuck:
-    """A signal, or one component of it, in the stretches (first row, row after the last) in which it stands still."""
+    """A signal or a component, and the stretches (first row, row after the last) in which it stays constant."""
 
     name: str
     array: SignalArray
@@ -82,7 +82,7 @@ class _Stuck:
 
 
 def _company_of(recording: Recording, first: _Stuck, alike: list[_Stuck]) -> list[str]:
-    """Further signals of a table whose log stood still: nothing else tells that they should have moved."""
+    """Further signals of the table that are constant in the same stretches; no other evidence says they should move."""
     known = {first.name, *(other.name for other in alike)}
     found = []
     for name, array in recording.signals.items():
@@ -96,7 +96,7 @@ def _company_of(recording: Recording, first: _Stuck, alike: list[_Stuck]) -> lis
 
 
 def _alike(one: _Stuck, other: _Stuck) -> bool:
-    """True if two signals of one table stood still together: then the log did, not a sensor."""
+    """True if two signals of one table stay constant at the same time: then the log stopped, not a sensor."""
     if one.array.stream != other.array.stream or not one.array.stream or one.component or other.component:
         return False
     a, b = (max(x.spans, key=lambda span: span[1] - span[0]) for x in (one, other))
@@ -105,7 +105,7 @@ def _alike(one: _Stuck, other: _Stuck) -> bool:
 
 
 def _constant(value: NDArray[np.float64]) -> bool:
-    """True if all there is of a signal is one value."""
+    """True if all finite values of each component are equal."""
     for column in value.T:
         sound = column[np.isfinite(column)]
         if sound.size == 0 or sound[0] != sound[-1] or (sound != sound[0]).any():
@@ -176,7 +176,7 @@ def _stretches(array: SignalArray, flags: Flags, least: float) -> list[tuple[int
     enough = (array.time[spans[:, 1] - 1] - array.time[spans[:, 0] - 1] >= least) & (lengths >= FEWEST_STILL_SAMPLES)
     if not enough.any():
         return []
-    # the channel's habit, from its other stretches: a coarse one stays often, and for long
+    # usual length, from the other still stretches of the channel: a coarse channel stays constant often and long
     others = lengths[~enough]
     habit = float(np.percentile(others, 99)) if others.size else 0.0
     enough &= lengths >= STILLNESS_RATIO * habit
@@ -184,13 +184,13 @@ def _stretches(array: SignalArray, flags: Flags, least: float) -> list[tuple[int
 
 
 def _company(array: SignalArray, span: tuple[int, int]) -> bool:
-    """True if the other components change often enough meanwhile: one that stands still while new samples came."""
+    """True if the other components change often in the stretch, so new samples arrived."""
     part = array.value[span[0] : span[1]]
     return int((part[1:] != part[:-1]).any(axis=1).sum()) >= FEWEST_STILL_SAMPLES
 
 
 def _others_moved(recording: Recording, name: str, array: SignalArray, span: tuple[int, int]) -> bool:
-    """True if something else shows that this signal should have changed; inertial sensors always should."""
+    """True if other signals show that this signal should change; inertial sensors should always change."""
     start, end = float(array.time[span[0]]), float(array.time[span[1] - 1])
     quantity = array.quantity
     if quantity in _INERTIAL_SIGNALS:
@@ -210,7 +210,7 @@ def _others_moved(recording: Recording, name: str, array: SignalArray, span: tup
     else:
         moved = _travelled(recording, "body_rate", start, end)
     if math.isnan(moved):
-        # nobody to ask: other measurements of the same quantity
+        # no related signal: use another measurement of the same quantity
         for label, other_array in recording.signals.items():
             if label != name and other_array.quantity == quantity:
                 moved = _spread(recording, label, start, end)

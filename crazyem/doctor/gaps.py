@@ -1,4 +1,4 @@
-"""Check: gaps and dropped records, each stream against its own period; pauses of the whole recording apart."""
+"""Check: gaps and dropped records, each stream against its own period; pauses of the whole recording separately."""
 
 from dataclasses import dataclass
 
@@ -10,18 +10,18 @@ from crazyem.recordings.finding import Finding, Grade, percent
 from crazyem.recordings.ordering import Intervals
 from crazyem.recordings.recording import Recording
 
-PAUSE_SECONDS = 1.0  # s of silence of everything: the recorder stood still, or the link was gone
-DEGRADING_LOST_SHARE = 0.05  # share of records lost from which results suffer
-LONG_GAP_SECONDS = 0.1  # s: longer than a drone's attitude lasts without measurement
-SIMULTANEOUS_SECONDS = 0.6  # s
-_CATCH_UP_INTERVALS = 3  # neighbouring intervals over which a late record may catch up
-# A rate of its own: nine intervals in a row of which most are alike, and half as long again as the stream's period.
-# Loss at random makes unequal ones: of those of half the records lost a quarter are alike.
+PAUSE_SECONDS = 1.0  # s without any record: the recorder stopped, or the link was lost
+DEGRADING_LOST_SHARE = 0.05  # share of lost records that degrades results
+LONG_GAP_SECONDS = 0.1  # s; an attitude is not known for longer without a measurement
+SIMULTANEOUS_SECONDS = 0.6  # s, largest difference between ends that count as simultaneous
+_CATCH_UP_INTERVALS = 3  # neighbouring intervals that may be shorter after a late record
+# A stretch has a slower rate if most of nine intervals in a row are equal and 1.5 times the stream's period. Random
+# loss makes unequal intervals: if half of the records are lost, only a quarter are equal.
 _RATE_WINDOW, _SLOWER_RATIO, _INTERVAL_TOLERANCE, _EQUAL_INTERVAL_SHARE = 9, 1.5, 0.2, 0.8
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Records missing within streams, streams that stop early or start late, and silence of everything."""
+    """Findings about missing records, streams that stop early or start late, and pauses of all streams."""
     groups = [stream for stream in streams(recording) if stream.time.size > 1]
     if not groups:
         return []
@@ -33,7 +33,7 @@ def check(recording: Recording) -> list[Finding]:
     end = max(float(s.time.max()) for s in groups)
     axes: dict[tuple[str, int, float, float, float], list[Stream]] = {}
     for stream in groups:
-        if not all(array.quantity.startswith("setpoint") for array in stream.arrays):  # sent when somebody wants to
+        if not all(array.quantity.startswith("setpoint") for array in stream.arrays):  # setpoints come at any time
             axes.setdefault(stream.axis, []).append(stream)
     ends: list[_End] = []
     unused: list[str] = []
@@ -53,7 +53,7 @@ def check(recording: Recording) -> list[Finding]:
 
 
 def _known_losses(recording: Recording, sharing: list[Stream]) -> Intervals | None:
-    """Where records are missing by the sequence numbers of their source; None where it has none."""
+    """Intervals with missing records by the sequence numbers of the source; None if there are no such numbers."""
     counts = recording.metadata.get("lost_records", {})
     if not all(stream.name in counts for stream in sharing):
         return None
@@ -61,7 +61,7 @@ def _known_losses(recording: Recording, sharing: list[Stream]) -> Intervals | No
 
 
 def _unused(names: list[str]) -> list[Finding]:
-    """Streams that nothing here uses may come when they like: one note for all."""
+    """One finding for all irregular streams that no part of the program uses."""
     if not names:
         return []
     text = f"{listed(names)}: records missing, or published on change; nothing here uses them."
@@ -71,18 +71,18 @@ def _unused(names: list[str]) -> list[Finding]:
 def lost_records(time: NDArray[np.float64], period: float) -> NDArray[np.int64]:
     """(n - 1,) records missing between neighbours in (n,) increasing stamps.
 
-    A late record is followed by short intervals; a lost one is not. So each long interval is judged together with its
-    neighbours, and the least number that any such window needs is what was lost.
+    Short intervals follow a late record, but not a lost one. So each long interval is judged together with its
+    neighbours: the smallest number of missing records over all such windows is the number of lost ones.
     """
     alone = np.maximum(np.round(np.diff(time) / period).astype(np.int64) - 1, 0)
-    # what neighbours lost must not be charged to a gap; the second round knows which of them only came late
+    # losses of neighbours must not count twice; the second pass knows which neighbours were only late
     return _fewest_lost(time, period, alone, _fewest_lost(time, period, alone, alone))
 
 
 def _fewest_lost(
     time: NDArray[np.float64], period: float, alone: NDArray[np.int64], others: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """The fewest records missing at each long interval, over windows of up to `_CATCH_UP_INTERVALS` a side."""
+    """Fewest missing records at each long interval, over windows of up to `_CATCH_UP_INTERVALS` on either side."""
     lost = alone.copy()
     rows = np.flatnonzero(alone)
     before = np.concatenate([[0], np.cumsum(others)])
@@ -97,7 +97,7 @@ def _fewest_lost(
 
 
 def _pauses(groups: list[Stream]) -> Intervals:
-    """Silence of all streams at once: at least `PAUSE_SECONDS`, and much longer than the slowest of them is silent."""
+    """Intervals without any record: at least `PAUSE_SECONDS` and 20 times the shortest period of the streams."""
     merged = np.sort(np.concatenate([stream.time for stream in groups]))
     steps = np.diff(merged)
     rows = np.flatnonzero(steps >= PAUSE_SECONDS)
@@ -116,8 +116,10 @@ def _pause_finding(pauses: Intervals) -> Finding:
 
 
 def local_periods(time: NDArray[np.float64], period: float) -> NDArray[np.float64]:
-    """(n - 1,) s: the period that holds at each interval, of increasing stamps (n,): where a stream was slowed down,
-    nothing is missing."""
+    """(n - 1,) s, the period that holds at each interval of increasing stamps (n,).
+
+    It is larger where a stream runs at a slower rate: there no records are missing.
+    """
     steps = np.diff(time)
     local = np.full(steps.size, period)
     if steps.size < _RATE_WINDOW:
@@ -129,7 +131,7 @@ def local_periods(time: NDArray[np.float64], period: float) -> NDArray[np.float6
     ) >= _EQUAL_INTERVAL_SHARE
     for first in np.flatnonzero(alike & (middle > _SLOWER_RATIO * period)):
         local[first : first + _RATE_WINDOW] = np.maximum(local[first : first + _RATE_WINDOW], middle[first])
-    # the window reaches over the change of rate: a short interval in it is of the faster rate
+    # a window may contain the change of rate: short intervals in it belong to the faster rate
     return np.where(steps < 0.5 * local, period, local)
 
 
@@ -140,7 +142,7 @@ def _drops(
     local = local_periods(time, rhythm.period)
     slowed = local > rhythm.period
     lost[slowed] = np.maximum(np.round(np.diff(time)[slowed] / local[slowed]).astype(np.int64) - 1, 0)
-    if known is not None:  # the source counts what it sends
+    if known is not None:  # the source numbers its records
         overlap = np.zeros(lost.size, bool)
         for start, end in known:
             overlap |= (time[1:] > start) & (time[:-1] < end)
@@ -186,7 +188,7 @@ def _number(count: int, word: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _End:
-    """Where signals have no values at the start or the end of the recording."""
+    """An interval at the start or the end (`last`) of the recording without values of some signals."""
 
     last: bool
     start: float
@@ -195,7 +197,7 @@ class _End:
 
 
 def _ends(stream: Stream, rhythm: Cadence, begin: float, end: float) -> list[_End]:
-    """Signals that cover less than the recording."""
+    """The ends of the recording at which signals of a stream have no values."""
     least = max(1.0, 20.0 * rhythm.period)
     found = []
     for name, array in zip(stream.names, stream.arrays, strict=True):
@@ -212,7 +214,7 @@ def _ends(stream: Stream, rhythm: Cadence, begin: float, end: float) -> list[_En
 
 
 def _end_findings(ends: list[_End], duration: float) -> list[Finding]:
-    """One finding for the signals that fall silent, or come, at about the same time."""
+    """One finding for all signals that end, or begin, at about the same time."""
     found = []
     while ends:
         one = ends[0]

@@ -1,5 +1,7 @@
-"""One measurement against what other streams predict for it, under several hypotheses: what rates, velocities and
-forces have in common."""
+"""Comparison of a measurement with predictions from other streams; the checks of rates, velocities and forces use it.
+
+Each prediction belongs to a hypothesis about the measurement's frame, axes or meaning.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,28 +19,28 @@ from crazyem.recordings.recording import SignalArray
 
 Array = NDArray[np.float64]
 
-SLOPE_WINDOW = 0.5  # s, window for slopes: motion slow enough for the filters of any stream
-ROW_STRIDE = 3  # grid steps between rows, more in recordings of more than a few minutes
-MOST_COMPARED_ROWS = 6000  # at most
-LEAST_SCALE_COVERAGE = 0.5  # share of the time that a scale fault must have been seen over
+SLOPE_WINDOW = 0.5  # s, window for slopes: filters of streams do not change motion this slow
+ROW_STRIDE = 3  # grid steps between rows; more in recordings of more than a few minutes
+MOST_COMPARED_ROWS = 6000  # most rows of a comparison
+LEAST_SCALE_COVERAGE = 0.5  # least share of the time that the data of a scale fault cover
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """One measurement against one prediction.
+    """Result of the comparison of one measurement with its predictions.
 
     Attributes:
-        against: name of what it was compared with.
+        against: name of the signal that the predictions come from.
         choice: which hypothesis holds.
-        lag: s by which the measurement is late; already taken out.
+        lag: s by which the measurement is late; already removed.
         whole: slope of the measurement against the chosen prediction, all components together.
-        single: of each component.
+        single: the same for each component.
         offset: (3,) median of measurement minus slope times prediction.
         offset_error: (3,) its standard error.
         covered: share of the common time that the windows of the slope cover.
         mean: (3,) of the measurement.
         predicted: (3,) mean of the declared prediction.
-        mean_error: (3,) its standard error, less what the prediction explains.
+        mean_error: (3,) standard error of `mean`, without the part that the prediction explains.
     """
 
     against: str
@@ -59,7 +61,7 @@ class Comparison:
 
     @property
     def explained(self) -> float:
-        """By the best hypothesis."""
+        """Share of the variance that the best hypothesis explains."""
         return self.choice.explained[self.choice.best]
 
     def evidence(self) -> dict[str, float]:
@@ -77,7 +79,7 @@ class Comparison:
 
 
 def _aligned(array: SignalArray, grid: Grid, declared: Track, window: Window) -> tuple[Track, float]:
-    """A measurement on the grid without its lag behind a smoothed prediction, and that lag [s]; 0 if none is seen."""
+    """A measurement on the grid without its lag behind a smoothed prediction, and this lag [s]; 0 if unknown."""
     raw = track(array, grid)
     late = delay(declared, window.mean(raw))
     lag = 0.0 if late is None or late.at_edge or late.explained < 0.3 else late.value
@@ -94,16 +96,16 @@ def compare_hypotheses(
     least: float,
     offset: bool = True,
 ) -> Comparison | None:
-    """Compare a measurement with predictions; None where there is too little motion or data.
+    """Compare a measurement with predictions; None with too little motion or data.
 
     Args:
         array: the measurement, three components.
         grid: of the predictions.
-        against: name of what the predictions were made of.
-        candidates: name -> (how far-fetched, prediction before smoothing); the declared one first.
+        against: name of the signal that the predictions come from.
+        candidates: name -> (cost, lower for simpler hypotheses; prediction before smoothing); the declared one first.
         width: s, of the window.
-        least: rms about the mean that the declared prediction must have.
-        offset: the hypotheses are compared about the means.
+        least: least rms about the mean of the declared prediction.
+        offset: compare after the means are removed.
     """
     window = Window(width)
     stride = max(ROW_STRIDE, grid.size // MOST_COMPARED_ROWS)
@@ -125,7 +127,7 @@ def compare_hypotheses(
     name = choice.name or choice.best
     x = chosen[name][1]
     at = declared.value[rows]
-    if name in candidates:  # slopes are better seen in slow motion
+    if name in candidates:  # slow motion gives better slopes
         wide = Window(max(SLOPE_WINDOW, width))
         far_x, far_y = wide.mean(candidates[name][1]), wide.mean(raw)
         keep = np.flatnonzero(far_x.valid & far_y.valid)[::stride]
@@ -159,11 +161,11 @@ def _comparison(
 
 
 def agreed_scale(looks: Sequence[Comparison], least: float) -> tuple[Comparison, axes.ScaleFault, int] | None:
-    """A scale fault that no comparison contradicts; None if one that could see it sees none.
+    """A scale fault on which all comparisons agree; None if a precise comparison does not show it.
 
-    What a measurement is compared with may be at fault itself (an onboard attitude follows its own filter), so a fault
-    must show against all; and stretches between lost packets are no fair sample, so most of the time must be covered.
-    Returns the narrowest comparison, its fault, and the number of comparisons that show it.
+    The reference may be wrong itself (an onboard attitude follows its own filter), so all references must show the
+    fault. Stretches between lost packets are a biased sample, so the comparison must cover half of the time.
+    Returns the comparison with the narrowest interval, its fault, and the number of comparisons that show the fault.
     """
     found = []
     for one in looks:
@@ -194,10 +196,10 @@ def misread(
     """The finding that a vector is in another frame or has other axes than declared.
 
     Args:
-        check: whose finding. name: signal. noun: what the components are of ("body rate").
-        known: hypothesis -> what the vector then is, and what to do.
-        what: was made of what it was compared with.
-        fix: repairs the first of the known.
+        check: name of the check. name: signal. noun: quantity of the components ("body rate").
+        known: hypothesis -> its description and advice.
+        what: operation on the reference, as text before its name.
+        fix: the repair for the first entry of `known`.
     """
     choice, frame = seen.choice.name, seen.declared
     advice = "Correct its frame, axes or signs where it is read."
@@ -220,7 +222,7 @@ def misread(
 def wrong_unit(
     check: str, name: str, text: str, factor: float, evidence: Mapping[str, float], advice: str = "Correct its unit."
 ) -> Finding:
-    """The finding that a vector is `factor` times what it would be in SI."""
+    """The finding that a vector is `factor` times its value in SI units."""
     fix = Fix("scale", (name,), (1.0 / factor,) * 3)
     return Finding(check, Grade.UNUSABLE, text, name, (), evidence, advice, fix)
 
@@ -228,11 +230,11 @@ def wrong_unit(
 def wrong_scale(
     check: str, name: str, looks: Sequence[Comparison], least: float, *, alone: str, agreed: str
 ) -> list[Finding]:
-    """The finding that a signal is not the derivative of what it is compared with, by a factor; none if it is.
+    """The finding that a signal differs by a factor from the derivative of its reference; empty if it does not.
 
     Args:
-        check: whose finding. name: signal. looks, least: as for `agreed_scale`.
-        alone, agreed: advice where one comparison shows it, and where several do.
+        check: name of the check. name: signal. looks, least: as for `agreed_scale`.
+        alone, agreed: advice if one comparison, or several, show the factor.
     """
     found = agreed_scale(looks, least)
     if found is None:

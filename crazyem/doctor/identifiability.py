@@ -1,7 +1,7 @@
-"""What a recording could identify of its drone, and what not: a verdict, a reason and an expected error for each.
+"""Which parameters of the drone a recording can identify: a verdict, a reason and an expected error for each.
 
-The limits are those of the estimator (crazyem.estimation.verdict): 15 % is "yes"; an inertia far from any such drone's
-is not believed. The sums are in excitation.py.
+The limits are those of the estimator (crazyem.estimation.verdict): below 15 % the verdict is "yes"; an inertia far from
+those of similar drones is rejected. The regressions are in excitation.py.
 """
 
 import math
@@ -27,30 +27,30 @@ from crazyem.vehicle import GRAVITY, Vehicle
 Array = NDArray[np.float64]
 
 IDENTIFIABLE = 0.15  # relative standard deviation below which a parameter counts as identified
-WEAKLY_IDENTIFIABLE = 0.5  # and below which the data say anything beyond what is known of such drones anyway
-# |log| of an inertia over the nominal beyond which it is not believed: 3 sd of the estimator's prior
+WEAKLY_IDENTIFIABLE = 0.5  # the same below which the data add information to the prior
+# |log| of an inertia over the nominal one, above which it is rejected: 3 sd of the estimator's prior
 IMPLAUSIBLE_INERTIA = 1.5
-DOUBTFUL_INERTIA = 1.0  # and beyond which it is taken with care
-WINDOW_SAMPLES = 800  # samples the estimator looks back by default
+DOUBTFUL_INERTIA = 1.0  # the same above which the verdict is "weak"
+WINDOW_SAMPLES = 800  # default window of the estimator
 SHORTEST_AIRTIME = 2.0  # s in the air
 ACCELEROMETER_OFFSET = 0.02  # of gravity: 20 mg, typical zero-g offset of a BMI088
-TYPICAL_DRAG = 0.2  # 1/s, force per mass and speed: what the drag of a Crazyflie's rotors is near (Foerster 2015)
+TYPICAL_DRAG = 0.2  # 1/s, force per mass and speed: typical rotor drag of a Crazyflie (Foerster 2015)
 SCALE_REASON = "only its ratio to the rotors' thrust scale is seen"
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether one thing can be identified.
+    """Whether one parameter can be identified.
 
     Attributes:
         name: mass, Ixx, Iyy, Izz, motor_time_constant, input_delay, torque_offsets, drag or battery_law.
-        verdict: "yes", "weak" (better than nothing) or "no".
-        reason: why, one clause.
-        relative_sd: expected standard deviation from all of the flight, over the value; None where there is no answer
-            or the value may be zero.
+        verdict: "yes", "weak" (little information) or "no".
+        reason: of the verdict, one clause.
+        relative_sd: expected standard deviation from the whole flight, over the value; None if it is unknown or the
+            value may be zero.
         window_relative_sd: the same for the estimator's default window of 800 samples.
-        sd: the same in `unit`, None where there is no answer.
-        value: about which the error was computed, in `unit`; a rough fit, not an estimate to use.
+        sd: expected standard deviation in `unit`; None if unknown.
+        value: in `unit`, at which the error is computed; a rough fit, not an estimate to use.
     """
 
     name: str
@@ -119,7 +119,7 @@ def replay_objection(recording: Recording, vehicle: Vehicle) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Vertical:
-    """Specific force along body z over steps: response (k,) each, and what is not known of it, relative."""
+    """Specific force along body z over steps: response (k,) for each stretch, and its relative systematic error."""
 
     steps: Steps
     response: list[Array]
@@ -178,13 +178,13 @@ def _thrust(vertical: _Vertical, inputs: Inputs, *, tau: float, delay: float) ->
 
 
 def _lean(steps: Steps) -> float:
-    """How far thrust may be off for want of a tilt: half the mean square of the horizontal acceleration over g."""
+    """Relative error of the thrust if the tilt is unknown, from the mean square of horizontal acceleration over g."""
     squares = [np.mean((_slow(t, v[:, :2]) / GRAVITY) ** 2) for t, v in zip(steps.nodes, steps.values)]
     return 0.005 + float(np.max(squares))
 
 
 def _slow(time: Array, velocity: Array) -> Array:
-    """Horizontal acceleration over a fifth of a second, too long for noise to count."""
+    """Horizontal acceleration over 0.2 s: over this time noise does not matter."""
     far = max(1, round(0.2 / float(np.median(np.diff(time)))))
     if time.size <= far:
         return np.zeros((1, velocity.shape[1]))
@@ -216,7 +216,7 @@ def _rotation(
     where = f"{turn_from} at {rate:.0f} Hz, {inputs.signal} at {1.0 / float(np.median(np.diff(inputs.time))):.0f} Hz"
     inertias = [_inertia(i, fit, inputs, steps, vehicle, where) for i in range(3)]
     far = np.abs(fit.value[:3] - np.log(vehicle.inertia))
-    believed = bool(np.all(far[:2] <= IMPLAUSIBLE_INERTIA))  # about z there is little torque to tell them from
+    believed = bool(np.all(far[:2] <= IMPLAUSIBLE_INERTIA))  # torque about z is too small to judge Izz
     doubtful = math.hypot(*far) > 1.3 * DOUBTFUL_INERTIA
     return (
         *inertias,
@@ -326,7 +326,10 @@ def _drag(recording: Recording, air: Airtime) -> Verdict:
 def _sideways(
     velocity: tuple[Array, Array], attitude: tuple[Array, Array], force: tuple[Array, Array] | None, air: Airtime
 ) -> tuple[list[Array], list[Array], str, Steps | None]:
-    """Horizontal body components of specific force (2 k,) and their columns: velocity and a constant an axis."""
+    """Horizontal body components of specific force, and columns for each: velocity, and a constant for each axis.
+
+    Also the name of the source of the force, and the steps (None with too few samples).
+    """
     time, both = _with_attitude(velocity, attitude)
     source = "velocity and attitude"
     if force is not None:
@@ -390,12 +393,12 @@ def _grade(relative: float) -> str:
 
 
 def _stretch(steps: Steps) -> float:
-    """How much larger a random error is in one window of the estimator than in all of the flight; never below 1."""
+    """Random error in one window of the estimator over that in the whole flight; at least 1."""
     return math.sqrt(max(steps.count / steps.share / WINDOW_SAMPLES, 1.0))
 
 
 def _with_attitude(velocity: tuple[Array, Array], attitude: tuple[Array, Array] | None) -> tuple[Array, Array]:
-    """Velocity (n, 3) beside attitude (n, 4) at its stamps, where an attitude is near; or alone."""
+    """Velocity (n, 3) and attitude (n, 4) at the velocity's stamps that have an attitude near; or velocity alone."""
     if attitude is None:
         return velocity
     velocity = excitation.thinned(*velocity)

@@ -1,8 +1,8 @@
-"""Check: samples on straight lines through time, never measured, that no reader has marked.
+"""Check: samples that were interpolated along straight lines in time, not measured, and that no reader has marked.
 
-A measured signal is never exactly straight. Three samples in a row count as straight if the middle one is off the line
-by less than 1e-4 of the change (stamps are rounded, too) plus the signal's own resolution. Smooth signals at high rates
-come close to that without being interpolated; then near misses are as frequent as hits, and nothing is reported.
+A measured signal is never exactly straight. Three samples in a row count as straight if the deviation of the middle one
+from the line is less than 1e-4 of the change (stamps are rounded, too) plus the signal's resolution. Smooth signals at
+high rates are nearly straight without interpolation. Then near misses are as frequent as hits, and nothing is reported.
 """
 
 from collections.abc import Iterator
@@ -15,18 +15,21 @@ from crazyem.doctor.streams import COMMAND_SIGNALS, cadence, graded, places, run
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.recording import Recording, SignalArray
 
-STRAIGHT_DEVIATION = 1e-4  # of the change over two steps
-NEAR_MISS_DEVIATION = 1e-3  # a near miss
-LEAST_RESOLUTION_STEPS = 1000.0  # steps over two samples, in units of the resolution, below which nothing can be said
-DEGRADING_INTERPOLATED_SHARE = 0.05  # share of samples from which results suffer
-RESAMPLED_SHARE = 0.5  # share of the moving samples from which the whole signal was drawn from a slower one
-_SLOW_SIGNALS = frozenset({"voltage"})  # varies so slowly that straight lines do it no harm
+STRAIGHT_DEVIATION = 1e-4  # largest deviation of a hit, over the change over two steps
+NEAR_MISS_DEVIATION = 1e-3  # the same for a near miss
+LEAST_RESOLUTION_STEPS = 1000.0  # least change over two steps, in units of the resolution, for a judgement
+DEGRADING_INTERPOLATED_SHARE = 0.05  # share of samples that degrades results
+RESAMPLED_SHARE = 0.5  # share of the moving samples from which the whole signal counts as resampled from a slower one
+_SLOW_SIGNALS = frozenset({"voltage"})  # change so slowly that interpolation does no harm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Straightness:
-    """(n,) flags of the samples of one signal: `on` lies on the line between its neighbours, `near` almost, and the
-    signal moves there; `bend`: it is off that line."""
+    """(n,) flags of the samples of one signal.
+
+    `on`: the signal moves and the sample lies on the line between its neighbours. `near`: it almost does. `bend`: the
+    sample is off this line.
+    """
 
     on: NDArray[np.bool_]
     near: NDArray[np.bool_]
@@ -34,7 +37,7 @@ class Straightness:
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Runs of interpolated samples and whole signals drawn up from a slower rate, one signal at a time."""
+    """Findings about runs of interpolated samples and about signals resampled from a slower rate."""
     found: list[Finding] = []
     for name, array in recording.signals.items():
         if array.quantity and array.quantity not in COMMAND_SIGNALS and array.time.size >= 8:
@@ -47,7 +50,7 @@ def straightness(time: NDArray[np.float64], value: NDArray[np.float64]) -> Strai
 
     Args:
         time: (n,) s, increasing; may be uneven.
-        value: (n, c), any unit; a component that does not move is no evidence, one that moves off the line is.
+        value: (n, c), any unit; a component that does not move is no evidence, a component off the line is.
     """
     n = time.size
     span = time[2:] - time[:-2]
@@ -65,7 +68,7 @@ def straightness(time: NDArray[np.float64], value: NDArray[np.float64]) -> Strai
             bend[1:-1] |= ~(deviation <= STRAIGHT_DEVIATION * change + resolution)
             off_near[1:-1] |= ~(deviation <= NEAR_MISS_DEVIATION * change + resolution)
             moving[1:-1] += change > LEAST_RESOLUTION_STEPS * resolution
-    # two components on a line are evidence; one alone only if its neighbour in time is on it too
+    # two components on their lines are evidence; a single one only if a neighbour in time is on a line, too
     on = (moving > 0) & ~bend
     alone = on & (moving == 1)
     lonely = alone.copy()
@@ -77,7 +80,7 @@ def straightness(time: NDArray[np.float64], value: NDArray[np.float64]) -> Strai
 
 
 def _resolution(column: NDArray[np.float64]) -> float:
-    """The step in which a column can change, from above: the least difference of some thousand of its values."""
+    """Upper bound of the resolution of a column: the smallest difference between some thousand of its values."""
     some = column[:: max(1, column.size // 4000)]
     values = np.unique(some[np.isfinite(some)])
     return float(np.diff(values).min()) if values.size > 1 else 0.0
@@ -95,11 +98,11 @@ def _signal(name: str, array: SignalArray) -> Iterator[Finding]:
         return
     line = straightness(time, value)
     hits, misses = int(line.on.sum()), int(line.near.sum())
-    # a smooth signal has nine near misses for every hit by chance
+    # by chance, a smooth signal has nine near misses for every hit
     if hits < 2 or hits < 0.5 * misses:
         return
     if array.marked.any() and hits < DEGRADING_INTERPOLATED_SHARE * time.size:
-        return  # the reader has dealt with this signal, by its own rule
+        return  # the reader has already marked this signal by its own rule
     present = int(np.isfinite(value).all(axis=1).sum())
     share = hits / present
     wide = line.on.copy()

@@ -1,4 +1,4 @@
-"""What is in a recording: its signals, clocks and origin, how hard it flew, and what could be identified from it."""
+"""Contents of a recording: signals, clocks, origin, extremes of the motion, and what can be identified from it."""
 
 import math
 from collections.abc import Mapping
@@ -16,9 +16,9 @@ from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.thrust import kind_objection, vehicle_for, weight_objection
 from crazyem.vehicle import Vehicle
 
-_MOST_ENTRIES = 12  # of a section of metadata that are shown as text
-_MOST_FLIGHTS = 4  # that the text names
-_MOST_SIGNALS = 16
+_MOST_ENTRIES = 12  # most entries of a section of metadata in the text
+_MOST_FLIGHTS = 4  # most flights in the text
+_MOST_SIGNALS = 16  # most signals in the text
 _LONGEST_TEXT = 120  # characters of a metadata value that are shown
 
 
@@ -28,12 +28,12 @@ class SignalRow:
 
     Attributes:
         name, quantity, unit, frame, clock, stream, source: as in `SignalArray`.
-        samples: how many.
+        samples: number of samples.
         start_s, end_s: first and last stamp, on the recording's time axis.
-        rate_hz: samples less one over the time from the first to the last: the mean rate, gaps included.
-        period_s: median time between samples; its inverse is the rate where nothing is lost.
-        missing_share: samples with a component that is no number in the file itself.
-        marked_share: samples that the reader marked as never measured.
+        rate_hz: mean rate, gaps included: (samples - 1) over the time from the first to the last.
+        period_s: median time between samples; its inverse is the rate without losses.
+        missing_share: share of samples with a component that is not a number in the file.
+        marked_share: share of samples that the reader marked as not measured.
         longest_gap_s: longest time between two samples.
     """
 
@@ -56,11 +56,11 @@ class SignalRow:
 
 @dataclass(frozen=True, slots=True)
 class ClockRow:
-    """One clock: its name, its signals' first and last stamp [s], and its stamps' drift against the host if known.
+    """One clock: its name, number of signals, first and last stamp [s], and its drift against the host if known.
 
     Attributes:
-        against_host_ppm: how much faster than the host's clock it runs, from a straight line through the arrival
-            times, in millionths; None without arrival times.
+        against_host_ppm: rate of the clock over that of the host's clock, less 1, in millionths, from a straight line
+            through the arrival times; None without arrival times.
     """
 
     name: str
@@ -72,14 +72,14 @@ class ClockRow:
 
 @dataclass(frozen=True, slots=True)
 class Inventory:
-    """What is in a recording. `to_dict` is JSON, `text` is for a terminal.
+    """Contents of a recording. `to_dict` is for JSON, `text` is for a terminal.
 
-    Attributes (besides those that explain themselves):
-        kind: of vehicle, by its autopilot; "" where nobody says.
-        other_kind: why the models here are not of this kind of vehicle; "" where they are.
-        unlike: why the rotors do not fit the vehicle; "" where they do.
-        on_the_ground: why nothing was flown; "" if something was.
-        no_replay: why `crazyem replay` cannot use it; "" if it can.
+    Attributes (the others explain themselves):
+        kind: of vehicle, from its autopilot; "" if unknown.
+        other_kind: why the models do not describe this kind of vehicle; "" if they do.
+        unlike: why the rotors do not fit the vehicle; "" if they do.
+        on_the_ground: why there was no flight; "" if there was one.
+        no_replay: why `crazyem replay` cannot use the recording; "" if it can.
     """
 
     path: str
@@ -123,7 +123,7 @@ class Inventory:
         }
 
     def text(self, *, everything: bool = False) -> str:
-        """What matters first, in at most 20 lines; with `everything` metadata, clocks and all signals below."""
+        """A summary of at most 20 lines; with `everything`, then also metadata, clocks and all signals."""
         head = f"{self.path}: {self.source}, {self.duration_s:.2f} s, {self.samples} samples"
         parts = [head, *self._vehicle_lines(), *_flight_lines(self.envelope, self.on_the_ground)]
         parts += [f"what it could identify, as vehicle {self.vehicle}:", *_verdict_lines(self.verdicts)]
@@ -137,18 +137,18 @@ class Inventory:
         return "\n".join(parts)
 
     def _vehicle_lines(self) -> list[str]:
-        """What flew, and what speaks against judging it by the vehicle."""
+        """Kind of vehicle, and reasons why the vehicle's models may not fit."""
         said = self.other_kind or (f"{self.kind}, by its autopilot" if self.kind else "")
         lines = [f"vehicle: {said}"] if said else []
         return [*lines, *([f"weight: {self.unlike}"] if self.unlike else [])]
 
 
 def inventory(recording: Recording, vehicle: Vehicle | None = None) -> Inventory:
-    """What is in a recording.
+    """The inventory of a recording.
 
     Args:
         recording: any.
-        vehicle: whose rotor law and inertia to judge by; None: the one it was flown with, else by what it logs.
+        vehicle: gives rotor law and inertia; None: the vehicle named in the recording, else chosen by its signals.
     """
     vehicle = vehicle or vehicle_for(recording)
     air = airtime(recording)
@@ -218,7 +218,7 @@ def _clocks(recording: Recording) -> tuple[ClockRow, ...]:
 
 
 def _against_host(array: SignalArray) -> float | None:
-    """How much faster the stamps run than the host's clock [1e-6], by least squares; None with too little to tell."""
+    """Rate of the stamps over that of the host's clock, less 1 [1e-6], by least squares; None with too few data."""
     good = np.isfinite(array.host_time) & np.isfinite(array.time)
     if good.sum() < 10:
         return None
@@ -231,7 +231,7 @@ def _against_host(array: SignalArray) -> float | None:
 
 
 def _short(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, str]]:
-    """Metadata without what is too long to read, such as whole tables and vehicle files."""
+    """Metadata without long values such as whole tables and vehicle files."""
     kept: dict[str, dict[str, str]] = {}
     for section, values in metadata.items():
         for key, value in values.items():
@@ -241,7 +241,7 @@ def _short(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, str
 
 
 def _listed(values: dict[str, Any]) -> dict[str, Any]:
-    """Tuples as lists, and numbers that JSON has no word for as None."""
+    """Values for JSON: tuples become lists, numbers that are not finite become None."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, tuple | list):
@@ -294,7 +294,7 @@ def _clock_lines(rows: tuple[ClockRow, ...]) -> list[str]:
 
 
 def _flight_lines(e: Envelope, on_the_ground: str) -> list[str]:
-    """Time in the air, what says so, and how hard it flew: three lines at most."""
+    """Time in the air, the signals that show it, and extremes of the motion: at most three lines."""
     by = "by " + ", ".join(e.judged_by) if e.judged_by else "no signal says when; all of it counts"
     spans = e.airborne_intervals_s
     shown = " and ".join(f"{a:.2f} to {b:.2f}" for a, b in spans[:_MOST_FLIGHTS])
@@ -331,7 +331,7 @@ def _flight_lines(e: Envelope, on_the_ground: str) -> list[str]:
 
 
 def _verdict_lines(verdicts: tuple[Verdict, ...]) -> list[str]:
-    """What can be identified, a line each; what cannot, a line for each reason."""
+    """One line for each identifiable parameter; one line for each reason why others are not identifiable."""
     lines = [verdict.line() for verdict in verdicts if verdict.verdict != "no"]
     reasons: dict[str, list[Verdict]] = {}
     for verdict in verdicts:
@@ -347,7 +347,7 @@ def _verdict_lines(verdicts: tuple[Verdict, ...]) -> list[str]:
 
 
 def _summary_lines(rows: tuple[SignalRow, ...]) -> list[str]:
-    """The signals that something here uses, with their rates, and how many others there are: two lines at most."""
+    """The signals in use with their rates, and the number of others: one line."""
     used = [row for row in rows if row.quantity]
     others = len(rows) - len(used)
     words = [row.name + (f" {row.rate_hz:.0f} Hz" if row.rate_hz else "") for row in used]

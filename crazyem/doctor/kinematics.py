@@ -1,8 +1,8 @@
-"""Signals side by side for the checks that use physics: tracks on one time grid, smoothed and differentiated alike.
+"""Signals for the checks that use physics: tracks on one time grid, smoothed and differentiated in the same way.
 
-A relation between two signals, y = dx/dt, is never tested by differentiating x: both sides are multiplied by the same
-smooth window k and integrated, k * y = k' * x. The window is a raised cosine of `width` seconds; what it cannot see
-(vibration, quantisation, the jitter of a 74 Hz stream) does not matter, and white noise is averaged away.
+A relation between two signals, y = dx/dt, is never tested by differentiating x directly: both sides are convolved with
+the same smooth window k, k * y = k' * x. The window is a raised cosine of `width` seconds. It suppresses vibration,
+quantisation, jitter of stamps and white noise.
 """
 
 import weakref
@@ -28,19 +28,19 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 GRID_STEP = 0.01  # s, of the grid
-LONGEST_GRID_SECONDS = 900.0  # s of a recording that are looked at, about its middle
-SHORTEST_GRID_SECONDS = 2.0  # s; nothing can be said of less
+LONGEST_GRID_SECONDS = 900.0  # s; of longer recordings only this part, about the middle, is used
+SHORTEST_GRID_SECONDS = 2.0  # s; shorter ones are not judged
 SMOOTHING_WINDOW = 0.16  # s, window for streams of 50 Hz or more
-LONGEST_SAMPLE_INTERVAL = 0.25  # s between samples, above which a stream tells nothing of motion
+LONGEST_SAMPLE_INTERVAL = 0.25  # s; slower streams have no information about motion
 IMPOSSIBLE_VALUE = 1e9  # of any quantity in any unit; other checks report it
 MOST_AVERAGED_SAMPLES = 1000  # samples averaged into one: 100 kHz
-BRIDGED_SECONDS = 0.045  # s; motion is slow against it
+BRIDGED_SECONDS = 0.045  # s, longest gap to interpolate: motion changes more slowly
 UP = np.array([0.0, 0.0, 1.0])
 GRAVITY = 9.81  # m/s^2; the true value differs from place to place by 0.3 %
 
 
 def quantity_of(name: str, array: SignalArray) -> str:
-    """The quantity a signal measures: what its reader says, else what its name says, else ""."""
+    """The quantity that a signal measures: by its reader, else by its name, else ""."""
     if array.quantity:
         return array.quantity
     stem = name.split("@", maxsplit=1)[0]
@@ -48,12 +48,12 @@ def quantity_of(name: str, array: SignalArray) -> str:
 
 
 def origin_of(name: str) -> str:
-    """Where a measurement comes from: "" for the recording's first choice, "mocap" for "position@mocap"."""
+    """Origin of a measurement: "" for the recording's first choice, "mocap" for "position@mocap"."""
     return name.partition("@")[2]
 
 
 def measurements(recording: Recording, quantity: str) -> dict[str, SignalArray]:
-    """All signals that measure a quantity for 2 s and four times a second, made light; the first choice first."""
+    """All signals that measure a quantity for at least 2 s at 4 Hz or more, through `light`; the first choice first."""
     found = {}
     for name, array in recording.signals.items():
         if quantity_of(name, array) == quantity and array.value.shape[1] == SIGNALS[quantity][0]:
@@ -64,7 +64,7 @@ def measurements(recording: Recording, quantity: str) -> dict[str, SignalArray]:
     return dict(sorted(found.items(), key=lambda item: (item[0] != quantity, item[0])))
 
 
-# The last signals that were made light, as long as their values live: seven checks ask for the same ones.
+# Cache of the last results of `light`, valid while the arrays exist: seven checks use the same signals.
 _light: OrderedDict[tuple[int, int, str], tuple[weakref.ref[Any], weakref.ref[Any], SignalArray]] = OrderedDict()
 _CACHED_RECORDINGS = 32
 
@@ -72,8 +72,8 @@ _CACHED_RECORDINGS = 32
 def light(array: SignalArray, quantity: str) -> SignalArray:
     """The sound samples of a signal, in the order of their stamps, averaged down to 100 Hz where it is faster.
 
-    Of equal stamps the first is kept. Not more than `LONGEST_GRID_SECONDS` about the middle of the samples (not of the
-    stamps, so that a stamp that jumped far away does no harm). Angles are picked, not averaged: they jump.
+    Of samples with equal stamps the first is kept. At most `LONGEST_GRID_SECONDS` about the median stamp are kept; a
+    few wrong stamps do not move the median. Angles are picked, not averaged, because they jump.
     """
     key = (id(array.time), id(array.value), quantity)
     known = _light.get(key)
@@ -103,7 +103,7 @@ def _lightened(array: SignalArray, quantity: str) -> SignalArray:
     if many > 1:
         rest = time.size // many * many
         first, last = time[:rest:many], time[many - 1 : rest : many]
-        # an average across a gap would lie between two times that it belongs to
+        # no average across a gap: it would belong to no time
         whole = last - first <= 2.0 * many * period
         if quantity == "euler":
             time, value = time[many // 2 : rest : many][whole], value[many // 2 : rest : many][whole]
@@ -129,7 +129,7 @@ class Grid:
 
 
 def grid_of(*arrays: SignalArray) -> Grid:
-    """A grid over the time that all the (light) arrays share; size 0 where there is none."""
+    """A grid over the common time of all arrays (from `light`); size 0 if there is too little."""
     if any(array.time.size < 4 for array in arrays):
         return Grid(0.0, 0)
     start = max(float(array.time[0]) for array in arrays)
@@ -139,7 +139,7 @@ def grid_of(*arrays: SignalArray) -> Grid:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Values (m, c) on a grid, and where they can be relied on (m,)."""
+    """Values (m, c) on a grid, and where they are valid (m,)."""
 
     value: Array
     valid: Mask
@@ -154,13 +154,13 @@ def width_for(*arrays: SignalArray) -> float:
 
 
 def track(array: SignalArray, grid: Grid, *, shift: float = 0.0, bridge: float = BRIDGED_SECONDS) -> Track:
-    """A light signal on a grid, by local cubics; not valid across gaps.
+    """A signal from `light` on a grid, interpolated by local cubics; not valid across gaps.
 
     Args:
         array: of one signal, from `measurements`.
         grid: from `grid_of`.
-        shift: s by which the stamps of the array are late; they are made earlier by as much.
-        bridge: s, gaps up to here are bridged by a cubic (and always those of 2.6 periods of the stream).
+        shift: s, delay of the stamps of the array; it is subtracted from them.
+        bridge: s, longest gap that a cubic bridges (always at least 2.6 periods of the stream).
     """
     time = array.time - shift
     if time.size < 4 or grid.size == 0:
@@ -194,7 +194,7 @@ class Window:
 
     @cached_property
     def slope(self) -> Array:
-        """Gives exactly 1 for a ramp of 1/s."""
+        """Kernel of the derivative, scaled to give exactly 1 for a ramp of 1/s."""
         i = np.arange(-self.half, self.half + 1)
         k = np.sin(np.pi * i / self.half)
         return np.asarray(k / (k @ i * GRID_STEP), float)
@@ -261,7 +261,7 @@ def continuous(q: Array) -> Array:
 
 
 def _cubic(time: Array, value: Array, at: Array, i: NDArray[np.int64]) -> Array:
-    """Values (m, c) at times (m,) in intervals i, by cubics with slopes of three points; held outside."""
+    """Values (m, c) at times (m,) in intervals i, by cubics with slopes from three points; constant outside."""
     step = np.diff(time)
     secant = np.diff(value, axis=0) / step[:, None]
     slope = np.empty_like(value)
@@ -276,11 +276,11 @@ def _cubic(time: Array, value: Array, at: Array, i: NDArray[np.int64]) -> Array:
 
 
 def _sound(array: SignalArray) -> Mask:
-    """(n,) samples with a time and all components, none of them absurd."""
+    """(n,) samples that have a time and all components, with plausible sizes."""
     sound = np.isfinite(array.time)
     sound &= ~array.marked
     for column in range(array.value.shape[1]):  # a reduction over a short axis costs ten times as much
-        sound &= np.abs(array.value[:, column]) < IMPOSSIBLE_VALUE  # not for NaN either
+        sound &= np.abs(array.value[:, column]) < IMPOSSIBLE_VALUE  # false for NaN
     return sound
 
 
@@ -303,7 +303,7 @@ class Pose:
 
 
 def poses(recording: Recording) -> list[Pose]:
-    """Every attitude that is a rotation; Euler angles only where there is no quaternion at all."""
+    """Every attitude quaternion; if there is none, quaternions from Euler angles (in radians)."""
     found = [Pose(name, array) for name, array in measurements(recording, "attitude").items()]
     if found:
         return found

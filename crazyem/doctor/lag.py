@@ -1,8 +1,8 @@
 """Check: lag between streams, and its drift inside a flight.
 
-Rates and velocities are compared, not angles and positions: what is slow says little of time. Each window of some
-seconds gives a lag by cross-correlation, with a standard error from what it leaves unexplained. What a motor command
-leads an acceleration by is physics and is not looked at.
+Rates and velocities are compared, not angles and positions: slow signals have little information about time. Each
+window of some seconds gives a lag by cross-correlation, with a standard error from the unexplained variance. The lead
+of a motor command over an acceleration is physics and is not examined.
 """
 
 import math
@@ -34,22 +34,22 @@ from crazyem.recordings.recording import Recording, SignalArray
 
 Array = NDArray[np.float64]
 
-LAG_CONFIDENCE = 0.995  # one-sided level at which a lag counts as told
-REPORTED_LAG = 0.003  # s, lag reported from here on
-DEGRADING_LAG = 0.010  # s, lag that degrades; half of it for its changes, which no shift repairs
-WINDOW_SECONDS = 5.0  # s, windows that each give a lag
-LEAST_WINDOW_SHARE = 0.6  # share of the variance that a window's best lag must explain
-MOST_WINDOWS = 40  # windows at most, longer ones then
-FEWEST_WINDOWS = 4  # windows at least
-LAG_BRIDGED_SECONDS = 0.1  # s; a cubic across a gap moves nothing in time
-LARGEST_WINDOW_ERROR = 0.02  # s, standard error above which a window says nothing
-LEAST_SCATTER_RATIO = 0.3  # of the windows' standard errors: the least scatter that is believed
-SMALLEST_WINDOW_ERROR = 0.0005  # s, below which no standard error of a window is believed
-UNSTEADY_SCATTER_RATIO = 2.5  # scatter of the windows over their standard errors, from which on the lag changes
+LAG_CONFIDENCE = 0.995  # one-sided confidence level of a significant lag
+REPORTED_LAG = 0.003  # s, smallest reported lag
+DEGRADING_LAG = 0.010  # s, lag that degrades; half of it for a drift, which no shift repairs
+WINDOW_SECONDS = 5.0  # s, length of the windows that each give a lag
+LEAST_WINDOW_SHARE = 0.6  # least share of the variance that a window's best lag explains
+MOST_WINDOWS = 40  # most windows; long recordings have longer windows
+FEWEST_WINDOWS = 4  # fewest windows
+LAG_BRIDGED_SECONDS = 0.1  # s, longest gap to interpolate: a cubic across a gap causes no lag
+LARGEST_WINDOW_ERROR = 0.02  # s, largest standard error of a window that is used
+LEAST_SCATTER_RATIO = 0.3  # lower bound of the windows' scatter, over their standard errors
+SMALLEST_WINDOW_ERROR = 0.0005  # s, lower bound of the standard error of a window
+UNSTEADY_SCATTER_RATIO = 2.5  # scatter of the windows over their standard errors, above which the lag changes
 
 
 def check(recording: Recording) -> list[Finding]:
-    """One finding for each stream (or origin within one) that is late or early against that of the first pose."""
+    """One finding for each stream (or origin within one) that is late or early against the stream of the first pose."""
     reference, base = _reference(recording)
     if base is None:
         return []
@@ -70,9 +70,9 @@ class _Changes:
     """How the lag changes inside a flight [s].
 
     Attributes:
-        start, end: of a line through the windows, at the ends of the flight.
-        drift, drift_error: end less start.
-        scatter: robust standard deviation of the windows about their middle, in their standard errors.
+        start, end: values of a line through the windows, at the ends of the flight.
+        drift, drift_error: end less start, and its standard error.
+        scatter: robust standard deviation of the windows about their median, over their standard errors.
         about_line: the same about the line.
         low, high: 10th and 90th percentile of the windows.
     """
@@ -90,7 +90,7 @@ class _Changes:
 
 @dataclass(frozen=True)
 class _Lag:
-    """Lag of a stream [s], as found from one of its signals over the whole flight, and its changes."""
+    """Lag of a stream [s] from one of its signals over the whole flight, and its changes."""
 
     signal: str
     against: str
@@ -104,13 +104,13 @@ class _Lag:
 
 @dataclass(frozen=True)
 class _Reference:
-    """What other streams are compared with: the first attitude, and the first position or velocity of its stream."""
+    """Reference of the comparisons: the first attitude, and the first position or velocity of its stream."""
 
     pose: Pose | None
     moving: tuple[str, SignalArray] | None
 
 
-# the way samples took: their stream, and their origin; a table may hold what came on several ways
+# stream and origin of samples; a table may hold signals of several origins
 _Path = tuple[str, str]
 
 
@@ -119,12 +119,12 @@ def _path(name: str, array: SignalArray) -> _Path:
 
 
 def _said(path: _Path, base: _Path) -> str:
-    """The stream, or the origin where two share a stream."""
+    """Text for a path: the stream, or the origin if both paths share a stream."""
     return path[1] or path[0] if path[0] == base[0] and path != base else path[0]
 
 
 def _reference(recording: Recording) -> tuple[_Reference, _Path | None]:
-    """The reference, and the way it came (None if there is none)."""
+    """The reference and its path (None if there is none)."""
     pose = next(iter(poses(recording)), None)
     movers = {**measurements(recording, "position"), **measurements(recording, "velocity")}
     path = _path(pose.name, pose.array) if pose else None
@@ -136,7 +136,7 @@ def _reference(recording: Recording) -> tuple[_Reference, _Path | None]:
 
 
 def _comparable(recording: Recording) -> list[tuple[str, SignalArray]]:
-    """Signals that tell of time; a velocity (which may be a filter's) only where its origin has no position."""
+    """Signals to compare; a velocity (which may come from a filter) only if its origin has no position."""
     positions = measurements(recording, "position")
     placed = {origin_of(name) for name in positions}
     velocities = measurements(recording, "velocity")
@@ -199,7 +199,7 @@ def _fit(name: str, against: str, first: Track, second: Track, grid: Grid, width
 
 
 def _changes(found: Array, start: float, end: float) -> _Changes:
-    """What windows (n, 3) of time, lag, standard error say of how the lag changes."""
+    """Changes of the lag, from windows (n, 3) of time, lag, standard error."""
     t, y, e = found.T
     middle = _weighted_median(y, 1.0 / e)
     ramp = _ramp(t, y)
@@ -223,10 +223,10 @@ def _changes(found: Array, start: float, end: float) -> _Changes:
 
 
 def _error(first: Track, second: Track, lag: float, explained: float, width: float) -> float:
-    """Standard error of a lag: what is unexplained, over how fast what is common changes; one sample a window width.
+    """Standard error [s] of a lag, from the unexplained variance and the frequency of the common part.
 
-    The mean square frequency of the common part is the covariance of the derivatives over that of the signals, to
-    which noise of either adds nothing.
+    The mean square frequency of the common part is the covariance of the derivatives over that of the signals; noise of
+    either signal does not change it. One sample per window width counts as independent.
     """
     steps = round(lag / GRID_STEP)
     n = len(first.value) - abs(steps)
@@ -251,7 +251,7 @@ def _robust(rest: Array) -> float:
 
 
 def _ramp(t: Array, y: Array) -> float:
-    """Slope by the median of the slopes of all pairs (Theil and Sen): stray windows do not move it."""
+    """Median of the slopes of all pairs (Theil and Sen), which is robust against outliers."""
     i, j = np.triu_indices(t.size, 1)
     return float(np.median((y[j] - y[i]) / (t[j] - t[i])))
 
@@ -277,7 +277,7 @@ def _judge(recording: Recording, base: _Path, path: _Path, lag: _Lag) -> Finding
         "lag_high_ms": 1e3 * high,
         "explained": lag.explained,
     }
-    # of a lag that drifts the middle of the line says more than the peak of the whole, which the lively parts decide
+    # for a drifting lag, the middle of the line is better than the overall peak, which depends on the parts with motion
     said = 0.5 * (lag.changes.start + lag.changes.end) if lag.changes is not None and drifts else lag.value
     how = "late" if said > 0 else "early"
     what = lag.signal if path[0] == lag.signal else f"The stream {_said(path, base)}"

@@ -1,4 +1,4 @@
-"""Check: values that are no numbers or that no drone can have, leaps that no drone can make, coarse positions."""
+"""Check: values that are not numbers or not possible, impossible jumps of the position, coarse positions."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -17,12 +17,12 @@ Rows = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """What a quantity can be.
+    """Bounds of a quantity.
 
     Attributes:
-        measure: (n, c) values to (n,) numbers that are compared.
-        low, high: bounds; outside is impossible.
-        words: what is impossible about it.
+        measure: function of (n, c) values; gives (n,) numbers to compare with the bounds.
+        low, high: bounds; values outside are impossible.
+        words: description of an impossible value.
     """
 
     measure: Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -40,13 +40,14 @@ def _largest(value: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _extreme(value: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The component that is furthest from the middle of 0..1."""
+    """(n,) the component furthest from 0.5."""
     low, high = value.min(axis=1), value.max(axis=1)
     return np.where(high - 0.5 > 0.5 - low, high, low)
 
 
-# Wide: only what no drone of this kind can do. Gyros end at 35 (70) rad/s, accelerometers at 24 (32) g an axis, the
-# fastest small rotors at 6000 rad/s; one to six cells give 2 to 26 V; smallest-three quaternions are unit within 0.002.
+# Wide limits: values outside are impossible. Gyros measure up to 35 (70) rad/s, accelerometers up to 24 (32) g an axis;
+# the fastest small rotors turn at 6000 rad/s; one to six cells give 2 to 26 V; the norm of smallest-three quaternions
+# is 1 within 0.002.
 VALUE_LIMITS: dict[str, Limit] = {
     "position": Limit(_largest, 0.0, 1e4, "further than 10 km from the origin"),
     "velocity": Limit(_largest, 0.0, 150.0, "faster than 150 m/s"),
@@ -64,8 +65,8 @@ VALUE_LIMITS: dict[str, Limit] = {
 ZERO_WITHOUT_SENSOR = {
     "voltage": "battery monitor",
     "rotor_speed": "rotor speed sensor",
-}  # read 0 where they are not there
-# What else the motors of a drone are told in: (words, unit in a mapping, lowest and highest of a typical value).
+}  # quantities that read 0 without their sensor
+# Other units of motor commands: (words, unit in a mapping, lowest and highest typical value).
 _MOTOR_UNITS = (
     ("pulse lengths in us", "us", 900.0, 2100.0),
     ("percent", "%", 2.0, 100.0),
@@ -74,7 +75,7 @@ _MOTOR_UNITS = (
 
 
 def _unit_of_motors(array: SignalArray, values: NDArray[np.float64]) -> str:
-    """What unit the numbers look like, as advice; "" for other quantities, and for no unit that is known."""
+    """Advice about the likely unit of motor commands; "" for other quantities and unknown units."""
     if array.quantity not in ("motor_command", "motor_request"):
         return ""
     typical = float(np.median(values))
@@ -92,7 +93,7 @@ def _unconnected(name: str, array: SignalArray) -> Finding:
 
 
 def check(recording: Recording) -> list[Finding]:
-    """NaN and infinities that are the file's own, impossible values and leaps, stamps that are no numbers."""
+    """Findings about NaN and infinities of the file itself, impossible values and jumps, stamps that are no numbers."""
     found: list[Finding] = []
     unmapped: list[tuple[str, int]] = []
     for name, array in recording.signals.items():
@@ -177,17 +178,17 @@ def _impossible(name: str, array: SignalArray, limit: Limit, sound: Rows) -> Ite
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-LEAST_JUMP = 0.1  # m in one step, beyond the motion around it: ten times what a step at 100 Hz and 1 m/s is
-CRASH_ACCELERATION = 100.0  # m/s^2 of a crash: by what a drone may leave the line between two samples
-JUMP_NOISE_RATIO = 12.0  # times the usual deviation of a step from the motion around it
-MEDIAN_STEPS = 5  # steps on each side whose median is the motion
-RETURN_SECONDS = 0.5  # s after which the position is where the motion before leads, if it leaps back
-COARSE_RESOLUTION = 0.005  # m, resolution from which a velocity over 0.1 s is known to no better than 5 cm/s
+LEAST_JUMP = 0.1  # m, least deviation of a step from the motion around it: ten times a step at 100 Hz and 1 m/s
+CRASH_ACCELERATION = 100.0  # m/s^2 of a crash: limits the deviation of a step that is still possible
+JUMP_NOISE_RATIO = 12.0  # least deviation of a step, over the median deviation
+MEDIAN_STEPS = 5  # steps on each side; their median is the motion
+RETURN_SECONDS = 0.5  # s, longest time until a jump back
+COARSE_RESOLUTION = 0.005  # m; a coarser one gives a velocity over 0.1 s to no better than 5 cm/s
 _FEWEST_SAMPLES = 50
 
 
 def position_jumps(name: str, array: SignalArray, *, furthest: float) -> list[Finding]:
-    """Findings of one position signal, of samples not further than `furthest` [m]; what is held is no new sample."""
+    """Findings about one position, from samples within `furthest` [m]; held values do not count as new samples."""
     with np.errstate(invalid="ignore"):
         good = np.isfinite(array.time) & (np.abs(array.value) <= furthest).all(axis=1) & ~same_as_before(array.value)
     sound = np.flatnonzero(good)
@@ -205,7 +206,7 @@ def position_jumps(name: str, array: SignalArray, *, furthest: float) -> list[Fi
 
 
 def _neighbour_velocity(velocity: Array) -> Array:
-    """(n, 3) the median velocity of the steps on both sides of each step, without itself."""
+    """(n, 3) the median velocity of each step and `MEDIAN_STEPS` steps on either side."""
     padded = np.pad(velocity, ((MEDIAN_STEPS, MEDIAN_STEPS), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * MEDIAN_STEPS + 1, axis=0)
     return np.median(windows, axis=2)
@@ -214,7 +215,7 @@ def _neighbour_velocity(velocity: Array) -> Array:
 def _found(
     name: str, array: SignalArray, sound: Indices, time: Array, value: Array, rows: Indices, off: Array
 ) -> Iterator[Finding]:
-    """One finding for all leaps: those that come back can be marked."""
+    """One finding for all jumps; samples between a jump and the jump back can be marked."""
     if not rows.size:
         return
     flags = np.zeros(array.time.size, bool)
@@ -225,14 +226,14 @@ def _found(
         first = int(rows[k])
         size = float(off[first])
         later = rows[k + 1 :][time[rows[k + 1 :]] - time[first] < RETURN_SECONDS]
-        # back where the motion before leads, to half of the leap
+        # back near the position before, within half of the jump
         back = next((int(r) for r in later if np.linalg.norm(value[r + 1] - value[first]) < 0.5 * size), None)
         if back is None:
             away += 1
             spans.append((float(time[first]), float(time[first + 1])))
             k += 1
         else:
-            flags[sound[first + 1] : sound[back + 1]] = True  # with what was held
+            flags[sound[first + 1] : sound[back + 1]] = True  # including held values
             spans.append((float(time[first + 1]), float(array.time[sound[back + 1] - 1])))
             k = int(np.searchsorted(rows, back, "right"))
     worst = int(rows[np.argmax(off[rows])])
@@ -257,7 +258,7 @@ def _found(
 
 
 def _coarse(name: str, array: SignalArray, value: Array) -> Iterator[Finding]:
-    """A note where the position is stored in coarse steps."""
+    """Finding if the position is stored in coarse steps."""
     grains = [_grain(column) for column in value.T]
     known = [g for g in grains if math.isfinite(g)]
     if not known or min(known) < COARSE_RESOLUTION:
@@ -269,7 +270,7 @@ def _coarse(name: str, array: SignalArray, value: Array) -> Iterator[Finding]:
 
 
 def _grain(column: Array) -> float:
-    """The step of which all changes of (n,) are multiples; NaN without changes or without such a step."""
+    """The step of which all changes of (n,) are multiples; NaN with too few changes, 0 without such a step."""
     steps = np.abs(np.diff(column))
     steps = steps[steps > 1e-9]
     if steps.size < 20:

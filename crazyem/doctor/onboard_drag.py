@@ -1,4 +1,4 @@
-"""Check: an onboard estimate that was told of a drag (kalman.dragB_*), so that its velocity follows that drag."""
+"""Check: an onboard estimator with a drag model (kalman.dragB_*), so that its velocity follows this model."""
 
 import math
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ _AXES = ("x", "y", "z")
 
 
 def check(recording: Recording) -> list[Finding]:
-    """A drag in the parameters read at connect, or written since. Files without parameters say nothing."""
+    """Finding if a drag is in the parameters read at connect or written later; none for files without parameters."""
     values = _parameters(recording)
     drag = {axis: values.get(f"kalman.dragB_{axis}", 0.0) for axis in _AXES}
     if not any(drag.values()):
@@ -37,7 +37,7 @@ def check(recording: Recording) -> list[Finding]:
 
 
 def _parameters(recording: Recording) -> dict[str, float]:
-    """The filter's drag parameters by name: as read at connect, or as last written in the recording."""
+    """Drag parameters of the onboard filter by name, as read at connect or last written in the recording."""
     values = _numbers(recording.metadata.get("parameter_values", {}))
     for event in recording.events:
         if event.kind == "parameter_write" and event.data.get("verified") is not False:

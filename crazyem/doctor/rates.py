@@ -1,4 +1,4 @@
-"""Check: body rate against the attitude's derivative: unit, frame, sign, scale, bias."""
+"""Check: body rate against the derivative of the attitude: unit, frame, sign, scale, bias."""
 
 import math
 
@@ -12,12 +12,12 @@ from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
 DEGREES = 180.0 / math.pi
-LEAST_RATE_RMS = 0.04  # rad/s rms of rotation about an axis, below which nothing is said
-LEAST_EXPLAINED_SHARE = 0.6  # share of the variance a hypothesis must explain
-SCALE_FAULT = 0.05  # scale fault reported from here on, if attitudes of two origins agree
-SCALE_FAULT_ONE_ORIGIN = 0.10  # if there is only one: an onboard attitude follows the gyro by a filter of its own
-REPORTED_BIAS = 0.05  # rad/s, reported from here on
-RATE_WINDOW = 0.24  # s: a gyro in flight is loud
+LEAST_RATE_RMS = 0.04  # rad/s rms about an axis; slower rotation is not judged
+LEAST_EXPLAINED_SHARE = 0.6  # least share of the variance that a hypothesis explains
+SCALE_FAULT = 0.05  # relative; smallest reported scale fault if attitudes of two origins agree
+SCALE_FAULT_ONE_ORIGIN = 0.10  # the same with one origin: an onboard attitude follows the gyro through a filter
+REPORTED_BIAS = 0.05  # rad/s, smallest reported bias
+RATE_WINDOW = 0.24  # s, smoothing window: a gyro in flight is noisy
 _UNITS = {
     "deg/s": "it is in deg/s, not rad/s",
     "converted": "it was in rad/s and was converted from deg/s once too often",
@@ -81,7 +81,7 @@ def _judge(name: str, looks: list[Comparison]) -> list[Finding]:
 
 
 def _bias(name: str, seen: Comparison) -> list[Finding]:
-    # in a steady turn a scale that is not known well looks like a bias
+    # in a steady turn, an uncertain scale looks like a bias
     unknown = np.abs(seen.predicted) * (seen.whole.far_high - seen.whole.far_low if seen.whole else 1.0)
     if not (np.abs(seen.offset) > np.maximum(REPORTED_BIAS, 5.0 * seen.offset_error) + unknown).any():
         return []

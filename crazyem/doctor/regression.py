@@ -1,10 +1,10 @@
-"""Regressions for the checks: slopes with noise on both sides, hypotheses compared block by block, lags, whitening.
+"""Regressions for the checks: slopes with noise on both sides, comparison of hypotheses over blocks, whitening.
 
-Neighbouring samples are not independent, so every uncertainty comes from blocks of about 1.5 s: of the slope by
-leaving out one block at a time (jackknife), of the difference between two hypotheses by a paired test over blocks.
+Neighbouring samples are not independent, so every uncertainty comes from blocks of about 1.5 s. That of a slope comes
+from leaving out one block at a time (jackknife), that of the difference between two hypotheses from a paired test.
 
-Generalised least squares under the noise a flight has: an autoregression whitens it (Cochrane and Orcutt 1949), and the
-long-run variance of what is left widens the result (Newey and West 1987).
+Generalised least squares uses the noise of the flight: an autoregression whitens the residual (Cochrane and Orcutt
+1949), and the long-run variance of the whitened residual widens the result (Newey and West 1987).
 """
 
 import math
@@ -19,11 +19,11 @@ from scipy import stats
 Array = NDArray[np.float64]
 
 BLOCK_SECONDS = 1.5  # s
-MOST_BLOCKS = 60  # blocks at most; longer ones then
-FEWEST_BLOCKS = 6  # blocks at least, else nothing is said
-SLOPE_CONFIDENCE = 0.9995  # one-sided level at which a slope counts as told
-RUNNER_UP_RATIO = 2.0  # what the runner-up leaves unexplained, over what the best leaves
-LOG_LIKELIHOOD_RATIO = 10.0  # log likelihood ratio between best and runner-up
+MOST_BLOCKS = 60  # most blocks; long recordings have longer blocks
+FEWEST_BLOCKS = 6  # fewest blocks for a judgement
+SLOPE_CONFIDENCE = 0.9995  # one-sided confidence level of a significant slope
+RUNNER_UP_RATIO = 2.0  # least unexplained variance of a beaten hypothesis, over that of the best
+LOG_LIKELIHOOD_RATIO = 10.0  # nats; least log likelihood ratio between the best and a beaten hypothesis
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,13 +32,14 @@ class Slope:
 
     Attributes:
         value: geometric mean of the two regressions.
-        direct: y on x; too small by the noise of x.
-        reverse: 1 / (x on y); too large by the noise of y. With independent noises the truth lies between the two.
-        low, high: 95 % interval: the two regressions, each widened by what the jackknife says.
+        direct: regression of y on x; noise of x makes it too small.
+        reverse: 1 / (regression of x on y); noise of y makes it too large. The true slope lies between the two if the
+            noises are independent.
+        low, high: 95 % interval: from the lower to the higher regression, each widened by its jackknife error.
         far_low, far_high: the same at the level `SLOPE_CONFIDENCE`.
-        explained: share of the variance that the two sides share (squared correlation).
-        samples: how many (rows times components).
-        blocks: how many, counted by the share of the motion that each holds.
+        explained: squared correlation.
+        samples: number of samples (rows times components).
+        blocks: effective number of blocks, weighted by the motion in each.
     """
 
     value: float
@@ -54,7 +55,7 @@ class Slope:
 
 
 def blocks(time: Array) -> NDArray[np.int64]:
-    """Block number (n,) of each row, from its time: 0, 1, .. without holes; at most `MOST_BLOCKS` blocks."""
+    """Block number (n,) of each row, from its time: 0, 1, .. without gaps; at most `MOST_BLOCKS` blocks."""
     if time.size == 0:
         return np.zeros(0, np.int64)
     length = max(BLOCK_SECONDS, float(time[-1] - time[0]) / MOST_BLOCKS + 1e-9)
@@ -71,8 +72,8 @@ def block_sums(block: NDArray[np.int64], *columns: Array) -> Array:
 def slope(x: Array, y: Array, block: NDArray[np.int64]) -> Slope | None:
     """Slope of y against x, both (n, c) or (n,); None with too few blocks or no common variance.
 
-    Rows far from the line are left out: by five times the median distance, and by as much as they are large (what is
-    off by a factor is no outlier, and a flight that mostly hovers must not lose its manoeuvres).
+    Outliers are left out: rows with a distance from the line above five times the median and above their own size. The
+    second condition keeps the manoeuvres of a flight that mostly hovers.
     """
     x, y = np.atleast_2d(x.T).T, np.atleast_2d(y.T).T
     keep = np.ones(len(x), bool)
@@ -146,12 +147,12 @@ class Choice:
     """Which hypothesis a measurement supports.
 
     Attributes:
-        name: the simplest hypothesis that no other beats for certain; "" if there are several of that simplicity.
-        best: the one that leaves least.
-        explained: share of the variance that each explains.
-        ratio: what the declared hypothesis leaves unexplained, over what the best leaves.
-        margin: what the best of those that were beaten leaves, over what the best leaves.
-        denied: the declared hypothesis is beaten for certain.
+        name: the simplest hypothesis that is not beaten with certainty; "" if several are equally simple.
+        best: the hypothesis with the least unexplained variance.
+        explained: share of the variance that each hypothesis explains.
+        ratio: unexplained variance of the declared hypothesis over that of the best.
+        margin: unexplained variance of the best beaten hypothesis over that of the best.
+        denied: the declared hypothesis is beaten with certainty.
     """
 
     name: str
@@ -165,17 +166,19 @@ class Choice:
 def choose(
     measured: Array, candidates: Mapping[str, tuple[int, Array]], block: NDArray[np.int64], *, offset: bool = True
 ) -> Choice | None:
-    """Which candidate (n, c), times one positive free factor and with free offsets, is the measurement (n, c)?
+    """The candidate that explains the measurement, up to one positive factor and free offsets.
 
     Args:
         measured: (n, c).
-        candidates: name -> (how far-fetched, (n, c) prediction); the one declared has 0 and is first.
+        candidates: name -> (cost, lower for simpler hypotheses; (n, c) prediction); the declared one (cost 0) is first.
         block: (n,) from `blocks`.
-        offset: free offset of each component.
+        offset: whether each component has a free offset.
 
-    "Beaten for certain" means: leaves at least `RUNNER_UP_RATIO` times as much as the best, not for the sake of a
-    tenth of the blocks, and beyond chance (log likelihood ratio of Gaussian residuals of at least
-    `LOG_LIKELIHOOD_RATIO`, one independent residual a block and component). None with too few blocks.
+    A hypothesis is beaten with certainty if three conditions hold. It leaves at least `RUNNER_UP_RATIO` times as much
+    unexplained as the best. The best wins without the tenth of the blocks that favours it most, too. The log
+    likelihood ratio of Gaussian residuals, one for each block and component, is at least `LOG_LIKELIHOOD_RATIO`.
+
+    Returns: None with too few blocks.
     """
     if len(measured) < 20:
         return None
@@ -210,7 +213,7 @@ def choose(
 
 
 def better(first: Array, second: Array, components: int = 1) -> bool:
-    """True if residuals (sums of squares per block) of the first are smaller beyond chance; see `choose`."""
+    """True if residuals (sums of squares per block) of the first are significantly smaller; see `choose`."""
     gain = np.sort(second - first)
     tenth = max(1, gain.size // 10)
     if gain.size < FEWEST_BLOCKS or gain[:-tenth].sum() <= 0.0:
@@ -225,27 +228,27 @@ _MAX_LAG = 100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A regression: value, what noise and what systematic error may be off by one standard deviation, all (p,)."""
+    """A regression: values, standard deviations by noise, and systematic errors, all (p,)."""
 
     value: Array
     sd: Array
     bias: Array
 
     def total(self, i: int, *, stretch: float = 1.0) -> float:
-        """Standard deviation of parameter i, the random part of a flight `stretch` times as long."""
+        """Standard deviation of parameter i, with the random part of a flight `stretch` times as long."""
         return math.hypot(float(self.sd[i]) / math.sqrt(stretch), float(self.bias[i]))
 
 
 def linear_fit(response: list[Array], columns: list[Array], *, share: float = 1.0, parts: int = 1) -> Fit | None:
-    """Generalised least squares of responses (k,) on columns (k, p), stretch by stretch.
+    """Generalised least squares of responses (k,) on columns (k, p), in stretches.
 
     Args:
-        response, columns: one array a stretch of neighbouring rows; NaN where missing.
-        share: of the data that these rows are: the standard deviations are those of all of it.
-        parts: into so many parts of one length the rows are cut too, and the standard deviations widened where they
-            disagree by more than their own (Birge 1932).
+        response, columns: one array for each stretch of neighbouring rows; NaN where missing.
+        share: share of these rows in the data; the standard deviations are those of all the data.
+        parts: number of equal parts that are also fitted separately. If their values scatter by more than their
+            standard deviations, the latter are widened (Birge 1932).
 
-    Returns: None with too few rows, or columns that say the same.
+    Returns: None with too few rows or linearly dependent columns.
     """
     fit = _linear_fit_once(response, columns, share)
     if fit is None or parts < 2:
@@ -261,7 +264,7 @@ def linear_fit(response: list[Array], columns: list[Array], *, share: float = 1.
 
 
 def _between(response: list[Array], columns: list[Array], low: int, high: int) -> list[tuple[Array, Array]]:
-    """Rows low..high-1 of all stretches put end to end."""
+    """Rows low..high-1, counted over all stretches."""
     pieces, start = [], 0
     for r, c in zip(response, columns):
         a, b = max(low - start, 0), min(high - start, r.size)
@@ -314,7 +317,7 @@ def autoregression(parts: list[Array]) -> Array:
 
 def filtered(weights: Array, part: Array) -> Array:
     """A stretch (k,) or (k, p) through the whitening filter, without its first rows."""
-    # what scipy.signal.lfilter does, to the bit; importing that takes a second
+    # same result as scipy.signal.lfilter, bit for bit; its import takes a second
     if part.ndim == 1:
         return np.convolve(weights, part)[AUTOREGRESSION_ORDER : part.size]
     return np.column_stack([np.convolve(weights, column)[AUTOREGRESSION_ORDER : column.size] for column in part.T])
@@ -327,7 +330,7 @@ def _inflation(terms: Array, covariance: Array) -> Array:
 
 
 def long_run(terms: Array) -> Array:
-    """Variance of the column sums of terms (n, p), Bartlett kernel. (p,)."""
+    """Long-run variance (p,) of the column sums of terms (n, p), with a Bartlett kernel."""
     n = terms.shape[0]
     lags = min(n // 8, _MAX_LAG)
     total = np.sum(terms**2, axis=0)

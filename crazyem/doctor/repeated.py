@@ -1,8 +1,7 @@
-"""Check: rows and values stored again without a new measurement, and the rate at which there really was one.
+"""Check: rows and values stored again without a new measurement, and the true rate of the measurements.
 
-A coarse signal of a drone that hovers repeats by chance. So only fine signals are believed: those whose steps
-are rarely as small as a few of their own resolutions. Coarse ones that repeat together with a fine one came in the same
-packet.
+A coarse signal of a hovering drone repeats by chance. So only fine signals are evidence: their steps are rarely as
+small as a few resolutions. Coarse signals that repeat together with a fine one come in the same packet.
 """
 
 import numpy as np
@@ -14,22 +13,22 @@ from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.ordering import inside, sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
 
-# may come from a slower task of the firmware than the rest of their table, and are held meanwhile
+# signals that may come from a slower firmware task than the rest of their table; the table then holds the last value
 _SLOW_SIGNALS = frozenset({"voltage", "motor_command", "motor_request", "rotor_speed"})
 Rows = NDArray[np.bool_]
 
-REPORTED_REPEAT_SHARE = 0.01  # share of repeated rows worth a word
-DEGRADING_REPEAT_SHARE = 0.05  # from which results suffer: a repeat is a wrong value of the age of one sample
-FINE_STEP_SHARE = 0.05  # share of the steps of a fine component that are within four resolutions
-ONE_PACKET_SHARE = 0.9  # share of common repeats from which signals came in one packet
+REPORTED_REPEAT_SHARE = 0.01  # smallest reported share of repeated rows
+DEGRADING_REPEAT_SHARE = 0.05  # share that degrades results: a repeat is a value that is one sample old
+FINE_STEP_SHARE = 0.05  # largest share of steps within four resolutions, for a fine component
+ONE_PACKET_SHARE = 0.9  # least share of common repeats of signals in one packet
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Repeated rows of each stream, then signals that are held between slower measurements of their own."""
+    """Findings about repeated rows of each stream, and about signals that are held between slower measurements."""
     flight = airtime(recording)
     found: list[Finding] = []
     if not flight.airborne:
-        return found  # what stands on the ground may repeat
+        return found  # signals may repeat while the drone stands on the ground
     for stream in streams(recording):
         found += _stream(stream, flight)
     return found
@@ -78,7 +77,7 @@ def _follows(flags: Rows, rows: Rows) -> bool:
 
 
 def _resting(array: SignalArray) -> Rows:
-    """Commands at their least or greatest value may stay there."""
+    """(n,) True where all commands are at their least or greatest value, at which they may stay."""
     if array.quantity not in ("motor_command", "motor_request"):
         return np.zeros(array.time.size, bool)
     sound = array.value[np.isfinite(array.value)]
@@ -89,9 +88,9 @@ def _resting(array: SignalArray) -> Rows:
 
 
 def _is_fine(array: SignalArray, considered: Rows) -> bool:
-    """True if the signal cannot repeat by chance: (almost) none of its steps is as small as its resolution.
+    """True if the signal cannot repeat by chance: almost none of its steps is as small as its resolution.
 
-    Three components of a compressed quaternion are coarse and the fourth follows from them, so three must be fine.
+    A compressed quaternion has three coarse components, and the fourth follows from them. So three must be fine.
     """
     rows = np.flatnonzero(considered)
     rows = rows[:: max(1, rows.size // 20_000)]
@@ -105,7 +104,7 @@ def _is_fine(array: SignalArray, considered: Rows) -> bool:
 
 
 def _hold(same: Rows, considered: Rows) -> float | None:
-    """Rows between changes if they come in a regular beat of at least 1.5, else None."""
+    """Period of the changes [rows] if it is regular and at least 1.5, else None."""
     changes = np.flatnonzero(~same & considered)
     if changes.size < 10:
         return None
@@ -113,7 +112,7 @@ def _hold(same: Rows, considered: Rows) -> float | None:
     for beat in sorted({float(np.percentile(beats, 10)), float(np.median(beats))}):
         if beat < 1.5:
             continue
-        # a value that happens to stay the same makes a beat of two
+        # a value that stays equal by chance makes an interval of two rows
         tolerance = max(1.0 if beat > 4 else 0.1, 0.2 * beat)
         single = np.abs(beats - beat) <= tolerance
         if not single.any():
@@ -127,7 +126,7 @@ def _hold(same: Rows, considered: Rows) -> float | None:
 
 
 def _creeps(array: SignalArray) -> bool:
-    """True if a signal moves a single resolution at a time: then the beat is that of the slope, not of a sensor."""
+    """True if a signal changes by single resolutions: then its slope causes the period, not the sensor."""
     steps = np.abs(np.diff(array.value[:, 0]))
     steps = steps[steps > 0]
     return steps.size < 10 or bool((steps <= 1.5 * steps.min()).mean() > 0.6)

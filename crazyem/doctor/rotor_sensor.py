@@ -1,9 +1,9 @@
-"""Check: a rotor speed sensor that counts a fraction or a multiple of the turns, drops to zero, or has nothing to say.
+"""Check: a rotor speed sensor that counts a fraction or a multiple of the turns, drops to zero, or has no values.
 
-A rotor cannot halve its speed within a hundredth of a second, a sensor can. So a stretch is a fault if the speed leaps
-by the fraction where it begins, leaps back where it ends, and lies meanwhile near that fraction of what the duty, or
-the other rotors, make one expect. A fraction for the whole flight is told from the expectation alone. Dropouts to zero
-are looked for beside it: a sensor that misses every second pulse often misses all of them for a while.
+A rotor cannot halve its speed within 0.01 s, but a faulty sensor can. The expected speed comes from the duty or from
+the other rotors. A stretch is a fault if the speed jumps by a fraction at its start, jumps back at its end, and is near
+that fraction of the expected speed between. A fraction for the whole flight follows from the expected speed alone.
+Dropouts to zero are searched as well: a sensor that misses every second pulse often misses all pulses for a while.
 """
 
 from collections.abc import Iterator
@@ -31,14 +31,14 @@ CONSTANT_FRACTIONS: dict[str, float] = {
     "three quarters": 3 / 4,
     "one and a half times": 3 / 2,
 }
-JUMP_TOLERANCE = 0.15  # relative deviation of a leap from the fraction
-SPEED_TOLERANCE = 0.35  # relative deviation from the expected speed meanwhile: rotors lag, and rotors differ
-# The same for a whole flight: rotors of one drone differ by some 3 %; and no nearer to another fraction than this share
-# of the way to it.
+JUMP_TOLERANCE = 0.15  # largest relative deviation of a jump from the fraction
+SPEED_TOLERANCE = 0.35  # the same of the speed from the expected speed: rotors lag, and they differ
+# The same for a whole flight: rotors of one drone differ by some 3 %. The second: largest distance to a fraction, as a
+# share of the distance between this fraction and the next (logarithms).
 FRACTION_TOLERANCE, FRACTION_SEPARATION = 0.1, 0.4
-LONGEST_SAMPLE_INTERVAL = 0.025  # s between samples, from which a real change may look like a leap
-DEGRADING_MISCOUNT_SHARE = 0.01  # share of the flight
-STOPPED_RATIO = 0.1  # of what is expected: standing still
+LONGEST_SAMPLE_INTERVAL = 0.025  # s; with slower sampling, a real change may look like a jump
+DEGRADING_MISCOUNT_SHARE = 0.01  # share of the flight that degrades results
+STOPPED_RATIO = 0.1  # speed over the usual speed, below which a rotor counts as stopped
 _MOST_JUMPS = 5000
 
 
@@ -89,7 +89,7 @@ def _signal(recording: Recording, name: str, array: SignalArray, rows: NDArray[n
 
 
 def _expected(recording: Recording, array: SignalArray, rows: NDArray[np.bool_]) -> NDArray[np.float64] | None:
-    """(n, c) rad/s each rotor should have; None if nothing tells."""
+    """(n, c) rad/s, the expected speed of each rotor; None if it is unknown."""
     speed = np.abs(array.value)
     command = recording.signals.get("motor_command")
     if command is not None and command.value.shape[1] == speed.shape[1] and command.time.size >= 50:
@@ -106,9 +106,9 @@ def _expected(recording: Recording, array: SignalArray, rows: NDArray[np.bool_])
 
 
 def _law(drive: NDArray[np.float64], speed: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Speed = a + b drive, one law for all rotors (a rotor that counts half all the time must not fit its own).
+    """Expected speed (n, c) = a + b drive, with one law for all rotors, so that a faulty sensor does not fit itself.
 
-    Median slopes over pairs (Theil-Sen on a thinned sample): half of the samples may be wrong.
+    b is the median slope over random pairs (Theil-Sen), so it is robust against outliers.
     """
     x, y = drive[rows].ravel(), speed[rows].ravel()
     sound = np.isfinite(x) & np.isfinite(y) & (y > 0)
@@ -128,7 +128,7 @@ def _law(drive: NDArray[np.float64], speed: NDArray[np.float64], rows: NDArray[n
 
 
 def _from_the_others(speed: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.float64] | None:
-    """The median of the other rotors."""
+    """(n, c) the median speed of the other rotors; None with fewer than three rotors."""
     count = speed.shape[1]
     if count < 3:
         return None
@@ -145,9 +145,9 @@ class _Jumps:
     """The known samples of a rotor.
 
     Attributes:
-        rows: (k,) of them.
-        ratio: (k,) of the speed to what is expected.
-        leap: (k - 1,) speed of a sample to that of the one before; NaN across a gap.
+        rows: (k,) their row numbers.
+        ratio: (k,) speed over expected speed.
+        leap: (k - 1,) speed over the speed of the sample before; NaN across a gap.
     """
 
     rows: NDArray[np.int64]
@@ -158,7 +158,7 @@ class _Jumps:
 def _jumps(
     time: NDArray[np.float64], speed: NDArray[np.float64], ratio: NDArray[np.float64], rows: NDArray[np.bool_]
 ) -> _Jumps | None:
-    """None if the speed never leaps."""
+    """The known samples and their speed ratios; None if the speed never jumps."""
     known = np.flatnonzero(rows & (speed > 0) & np.isfinite(ratio))
     if known.size < 3:
         return None
@@ -168,7 +168,7 @@ def _jumps(
 
 
 def _between(position_jumps: _Jumps, fraction: float) -> NDArray[np.int64]:
-    """Rows of stretches at a fraction of the expected speed that begin and end with a leap."""
+    """Rows of stretches at a fraction of the expected speed that begin and end with a jump."""
     starts = np.flatnonzero(np.abs(position_jumps.leap / fraction - 1.0) < JUMP_TOLERANCE)
     ends = np.flatnonzero(np.abs(position_jumps.leap * fraction - 1.0) < JUMP_TOLERANCE)
     near = np.abs(position_jumps.ratio / fraction - 1.0) < SPEED_TOLERANCE
@@ -180,7 +180,7 @@ def _between(position_jumps: _Jumps, fraction: float) -> NDArray[np.int64]:
         if start < after or not normal[start]:
             continue
         place = int(np.searchsorted(ends, start, side="right"))
-        # up to the leap back, or to the end of the flight
+        # up to the jump back, or to the end of the flight
         end = int(ends[place]) if place < ends.size else last
         if near[start + 1 : end + 1].mean() > 0.8 and (place == ends.size or normal[min(end + 1, last)]):
             found.append(position_jumps.rows[start + 1 : end + 1])
@@ -189,9 +189,9 @@ def _between(position_jumps: _Jumps, fraction: float) -> NDArray[np.int64]:
 
 
 def _stopped(ratio: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(n,) True where a rotor stands still that turned before or turns after.
+    """(n,) True where a rotor reads zero that turns before or after.
 
-    `ratio` (n,) of the speed to what is usual for this sensor; what the sensor does not know (NaN) is no evidence.
+    `ratio` (n,) is the speed over the usual speed by this sensor; NaN is no evidence.
     """
     flags = np.zeros(ratio.size, bool)
     known = np.flatnonzero(np.isfinite(ratio))
@@ -204,7 +204,7 @@ def _stopped(ratio: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.
 
 
 def _constant_fraction(ratio: NDArray[np.float64]) -> str:
-    """The fraction that a rotor counts all the time, "" if it counts right."""
+    """The fraction that a sensor counts during the whole flight; "" if it counts correctly."""
     sound = ratio[np.isfinite(ratio)]
     if sound.size < 50:
         return ""
@@ -259,7 +259,7 @@ def _finding(
 
 
 def _missing(name: str, array: SignalArray, rows: NDArray[np.bool_]) -> Iterator[Finding]:
-    """What the sensor itself said it does not know, a finding for all rotors."""
+    """Finding about samples that the sensor reported as unknown, one for all rotors."""
     nan = ~np.isfinite(array.value)
     flags = nan.any(axis=1) & array.marked & rows
     if not flags.any():

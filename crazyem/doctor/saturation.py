@@ -11,15 +11,15 @@ from crazyem.recordings.finding import Finding, Grade, intervals_of, percent
 from crazyem.recordings.ordering import Intervals, inside, ordered
 from crazyem.recordings.recording import Recording
 
-FULL_DUTY = 0.999  # of the greatest duty
-DEGRADING_SATURATED_SHARE = 0.005  # share of the flight from which thrust and torque are not what was asked for
-LOW_CELL = 3.3  # V a cell under load
-_CEILING_RUN = 3  # samples at exactly the same greatest value: a cap, not a maximum
+FULL_DUTY = 0.999  # share of the largest duty that counts as full
+DEGRADING_SATURATED_SHARE = 0.005  # share of the flight that degrades results: actual and commanded wrench differ
+LOW_CELL = 3.3  # V per cell under load, below which a battery is low
+_CEILING_RUN = 3  # samples in a row at the same largest value that show a limit
 _COMMAND_WORDS = {"motor_command": "duty", "motor_request": "thrust request"}
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Upper limit, and lower limit while airborne, of commanded duty and of requested thrust, a rotor at a time."""
+    """Findings about rotors at the upper or lower limit of commanded duty or requested thrust while airborne."""
     flight = airtime(recording)
     found: list[Finding] = []
     for name in ("motor_command", "motor_request"):
@@ -76,7 +76,7 @@ def _upper(
 
 
 def _is_ceiling(column: NDArray[np.float64], top: float, rows: NDArray[np.bool_]) -> bool:
-    """True if the greatest value is met too often, and too long at a time, for the maximum of a coarse signal."""
+    """True if the largest value is a limit: too frequent, and too long at a time, for a maximum of a coarse signal."""
     at_top = (column == top) & rows
     count = int(at_top.sum())
     spans = runs(at_top)
@@ -88,7 +88,7 @@ def _is_ceiling(column: NDArray[np.float64], top: float, rows: NDArray[np.bool_]
 def _lower(
     name: str, time: NDArray[np.float64], value: NDArray[np.float64], rows: NDArray[np.bool_], flight: Airtime
 ) -> Iterator[Finding]:
-    """Rotors at idle or off while airborne, but not in the first and last half second, when they start and stop."""
+    """Finding about rotors at idle or off while airborne, without the first and last 0.5 s (start and stop)."""
     inner: Intervals = tuple((a + 0.5, b - 0.5) for a, b in flight.airborne if b - a > 1.5)
     rows = rows & inside(time, inner)
     if rows.sum() < 20:
@@ -99,7 +99,7 @@ def _lower(
     idle = float(running.min()) if running.size else floor
     for rotor, column in enumerate(value.T):
         low = column[rows].min()
-        # a floor is a value that all four share: idle or zero
+        # the lower limit is common to all four rotors: idle or zero
         if low <= max(idle, floor) * (1.0 + 1e-6) and low < 0.35:
             flags[:, rotor] = (column <= low * (1.0 + 1e-6)) & rows
     any_rotor: NDArray[np.bool_] = np.logical_or.reduce(flags, axis=1)

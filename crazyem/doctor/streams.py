@@ -1,4 +1,4 @@
-"""What the stream checks share: signals sampled together, their real cadence, runs of rows, and when the drone flew."""
+"""Tools of the stream checks: signals sampled together, their true period, and runs of rows."""
 
 import math
 import zlib
@@ -12,9 +12,9 @@ from crazyem.recordings.finding import Grade, intervals_of
 from crazyem.recordings.ordering import Intervals
 from crazyem.recordings.recording import Recording, SignalArray
 
-MOST_INTERVALS = 50  # a finding names at most this many places, the longest ones; its evidence counts all
+MOST_INTERVALS = 50  # most intervals in a finding, the longest ones; its evidence counts all
 
-# What a drone is told or wants, rather than what was measured: may be straight, constant or stepped in good health.
+# Commands, not measurements: they may be straight, constant or stepped without a fault.
 COMMAND_SIGNALS = frozenset(
     {
         "setpoint_position",
@@ -34,7 +34,7 @@ class Stream:
     """Signals that were sampled together.
 
     Attributes:
-        name: for people: the name of the log block, table or topic, else the names of its signals.
+        name: to display: the name of the log block, table or topic, else the names of its signals.
         names: of its signals.
         arrays: of its signals, one time axis.
     """
@@ -69,13 +69,13 @@ class Stream:
 
     @property
     def slow(self) -> bool:
-        """True if it varies so slowly that a lost sample does not matter: the voltage alone."""
+        """True if the stream holds only the voltage, which varies so slowly that a lost sample does not matter."""
         return all(array.quantity == "voltage" for array in self.arrays)
 
 
 def streams(recording: Recording) -> list[Stream]:
     """Signals grouped by common time axis; those with a stamp that is not a number are left out."""
-    keys: dict[int, tuple[int, int]] = {}  # of a time axis: by its bytes; signals of a table mostly share the array
+    keys: dict[int, tuple[int, int]] = {}  # of time axes, from their bytes; signals of a table mostly share the array
     groups: dict[tuple[str, str, tuple[int, int]], list[str]] = {}
     for name, array in recording.signals.items():
         if array.time.size == 0:
@@ -94,7 +94,7 @@ def streams(recording: Recording) -> list[Stream]:
 
 
 def sole(names: Sequence[str]) -> str:
-    """The name of the only signal, "" of several: what a finding calls its signal."""
+    """The name of a finding's signal: that of the only one, "" for several."""
     return names[0] if len(names) == 1 else ""
 
 
@@ -107,12 +107,12 @@ def listed(names: Sequence[str], most: int = 4) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Cadence:
-    """How often a stream comes.
+    """Period and jitter of a stream.
 
     Attributes:
-        period: s between samples when none is lost; NaN with fewer than eight samples.
+        period: s between samples if none is lost; NaN with fewer than eight samples.
         jitter: s, median deviation of an interval from the period.
-        regular: True if the stream keeps to the period (but for losses); False for events.
+        regular: True if the stream keeps the period, apart from losses; False for events.
     """
 
     period: float
@@ -121,9 +121,9 @@ class Cadence:
 
 
 def cadence(time: NDArray[np.float64]) -> Cadence:
-    """The period of a stream from (n,) stamps in order, also if half of the samples were lost.
+    """The period of a stream from (n,) ordered stamps, even if half of the samples are lost.
 
-    Random loss stretches intervals to multiples of the period, of which the period itself stays the most frequent.
+    Random loss makes intervals that are multiples of the period; the period itself remains the most frequent.
     """
     steps = np.diff(time)
     steps = steps[:: max(1, steps.size // 50_000)]
@@ -146,7 +146,7 @@ def cadence(time: NDArray[np.float64]) -> Cadence:
 
 
 def _refined(time: NDArray[np.float64], period: float) -> float:
-    """The period over windows of sixteen samples: coarse stamps and jitter average out, losses are whole periods."""
+    """The period from spans of sixteen samples: jitter and rounding average out, losses are whole periods."""
     if time.size < 40:
         return period
     spans = (time[16:] - time[:-16])[:: max(1, time.size // 50_000)]
@@ -187,7 +187,7 @@ def same_as_before(value: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def graded(share: float, *, degrades: float, unusable: float = math.inf) -> Grade:
-    """By the share of samples concerned."""
+    """The grade of a finding by the share of its samples."""
     if share >= unusable:
         return Grade.UNUSABLE
     return Grade.DEGRADES if share >= degrades else Grade.HARMLESS

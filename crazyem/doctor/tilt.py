@@ -1,8 +1,8 @@
-"""Check: a tilted pose frame: its vertical against gravity as the accelerometer feels it.
+"""Check: a tilted pose frame, by comparison of its vertical with gravity from the accelerometer.
 
-In a frame that is tilted by a small rotation vector t, what is left of R f - dv/dt - g e3 is g (t x e3) + R b: the
-first part stays in the world, the second (bias or mounting of the accelerometer) turns with the body. Only turning
-tells them apart.
+In a frame with a small tilt t (rotation vector), the residual R f - dv/dt - g e3 is g (t x e3) + R b. The first part is
+constant in the world frame. The second part (bias b or mounting of the accelerometer) turns with the body. Only a
+change of heading separates the two.
 """
 
 import math
@@ -35,12 +35,12 @@ from crazyem.recordings.recording import Recording, SignalArray
 
 Array = NDArray[np.float64]
 
-REPORTED_TILT = math.radians(0.5)  # tilt reported from here on
-DEGRADING_TILT = math.radians(1.5)  # tilt that degrades
-REPORTED_SENSOR_ANGLE = math.radians(2.0)  # mounting or bias of the accelerometer, as an angle, reported from here on
-# smallest eigenvalue of the normalised normal matrix: half the variance of the heading in rad^2
+REPORTED_TILT = math.radians(0.5)  # smallest reported tilt
+DEGRADING_TILT = math.radians(1.5)  # tilt that degrades results
+REPORTED_SENSOR_ANGLE = math.radians(2.0)  # smallest reported mounting error or bias of the accelerometer, as an angle
+# least eigenvalue of the normalised normal matrix that separates tilt and bias: half the variance of the heading, rad^2
 SMALLEST_EIGENVALUE = 2e-3
-LARGEST_HALF_WIDTH = math.radians(0.5)  # 95 % half-width that a tilt of its own must be known to
+LARGEST_HALF_WIDTH = math.radians(0.5)  # largest 95 % half-width with which tilt and bias are reported separately
 
 
 def check(recording: Recording) -> list[Finding]:
@@ -83,7 +83,7 @@ def _look(recording: Recording, pose: Pose, name: str, array: SignalArray) -> Fi
 
 
 def _velocity(recording: Recording, pose: Pose) -> SignalArray | None:
-    """The velocity of the same origin, else the first; None where there is none."""
+    """The velocity of the pose's origin, else the first velocity; None if there is none."""
     found = measurements(recording, "velocity")
     same = [array for name, array in found.items() if origin_of(name) == origin_of(pose.name)]
     return next(iter([*same, *found.values()]), None)
@@ -108,7 +108,7 @@ def _residual(
 
 
 def _lag(recording: Recording, pose: Pose, array: SignalArray, grid: Grid) -> float:
-    """By how much the accelerometer is late: as the gyro that was sampled with it."""
+    """Delay of the accelerometer [s]: that of the gyro of the same stream, against the attitude; 0 if unknown."""
     for gyro in measurements(recording, "body_rate").values():
         if gyro.stream == array.stream and gyro.time.size == array.time.size:
             window = Window(0.24)
@@ -128,7 +128,7 @@ def _design(q: Array, *, both: bool) -> Array:
 
 
 def _separable(a: Array) -> bool:
-    """True if the heading changes enough for tilt and bias to have columns of their own."""
+    """True if the heading changes enough to separate tilt and bias."""
     flat = a.reshape(-1, a.shape[2])
     flat = flat / np.linalg.norm(flat, axis=0)
     return float(np.linalg.eigvalsh(flat.T @ flat)[0]) > SMALLEST_EIGENVALUE

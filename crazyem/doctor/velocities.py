@@ -1,4 +1,4 @@
-"""Check: velocity against the position's derivative, and positions of two origins: unit, frame, sign, scale."""
+"""Check: velocity against the derivative of position, and positions of two origins: unit, frame, sign, scale."""
 
 from crazyem.doctor import axes
 from crazyem.doctor.hypotheses import Comparison, agreed_scale, compare_hypotheses, misread, wrong_scale, wrong_unit
@@ -7,12 +7,12 @@ from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
-LEAST_VELOCITY_RMS = 0.04  # m/s rms along an axis, below which nothing is said
+LEAST_VELOCITY_RMS = 0.04  # m/s rms along an axis; slower motion is not judged
 LEAST_POSITION_RMS = 0.1  # m rms along an axis, the same for positions
 VELOCITY_WINDOW = 0.2  # s
 LEAST_EXPLAINED_SHARE = 0.6
 SCALE_FAULT = 0.05
-# slope of velocity against the position's derivative -> what that means, and which of the two is implausible
+# unit of the velocity or of the position -> slope of the velocity against the derivative of the position
 VELOCITY_UNITS = {"mm/s": 1e3, "cm/s": 1e2}
 POSITION_UNITS = {"mm": 1e-3, "cm": 1e-2}
 _MISREAD = {"body": ("it is in the body frame, not the world frame", "Rotate it into the world frame by the attitude.")}
@@ -54,7 +54,7 @@ def _compare(array: SignalArray, other: str, reference: SignalArray, attitudes: 
 
 
 def _compare_positions(array: SignalArray, other: str, reference: SignalArray) -> Comparison | None:
-    """Positions themselves: the derivative of a stream with late packets is no fair witness of its scale."""
+    """Comparison of positions, not of their derivatives: late packets distort the scale of a derivative."""
     grid = grid_of(array, reference)
     if grid.size == 0:
         return None

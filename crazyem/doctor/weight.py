@@ -1,7 +1,7 @@
 """Check: the mass that the rotors carry by the known thrust laws, against a mass that the publisher claims.
 
-Thrust over specific force along body z is a mass, but only as good as the thrust law: a law that is 20 % too strong
-and a drone that is 20 % too heavy look the same. So a finding names the ratio, never "the mass".
+Thrust over specific force along body z is a mass, but only as exact as the thrust law: a law that is 20 % too strong
+looks like a drone that is 20 % too heavy. So a finding gives the ratio, never "the mass".
 """
 
 import math
@@ -19,20 +19,20 @@ from crazyem.recordings.recording import Recording
 from crazyem.recordings.thrust import carried, vehicle_for, weight_objection
 from crazyem.vehicle import Vehicle, load_vehicle, preset_names
 
-REPORTED_MASS_DEVIATION = 0.15  # claimed mass against the nearest law: reported from here on
-LIFTING_THRUST_RATIO = 0.6  # of the median thrust while rotors turn: less is a take-off, a landing or the ground
-THRUST_BRIDGED_SECONDS = 0.15  # s, gaps in thrust and force that a mean may bridge
-FEWEST_BLOCK_ROWS = 25  # rows of a block at least (0.25 s)
+REPORTED_MASS_DEVIATION = 0.15  # smallest reported relative deviation of the claimed mass from the nearest law
+LIFTING_THRUST_RATIO = 0.6  # least thrust in flight over the median thrust: less is take-off, landing or the ground
+THRUST_BRIDGED_SECONDS = 0.15  # s, longest gap in thrust and force to interpolate
+FEWEST_BLOCK_ROWS = 25  # fewest rows of a block (0.25 s)
 
 
 @dataclass(frozen=True, slots=True)
 class Carried:
-    """What a thrust law says of a flight.
+    """Mass that a flight shows by a thrust law.
 
     Attributes:
         mass: kg, mean thrust over mean specific force along body z.
-        low, high: 95 % interval of the mean; the thrust law itself is not in it.
-        sag: relative change of that mass for each volt of battery [1/V]; NaN where the voltage hardly changes.
+        low, high: 95 % interval, without the error of the thrust law.
+        sag: relative change of this mass per volt of battery [1/V]; NaN if the voltage hardly changes.
         seconds: of flight used.
     """
 
@@ -44,7 +44,7 @@ class Carried:
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings where the publisher claims a mass that no known thrust law carries, or the vehicle does not fit."""
+    """Finding if no known thrust law gives the claimed mass; without a claim, if the vehicle does not fit."""
     claim = claimed_mass(recording)
     if claim is None:
         return _unlike(recording)
@@ -74,7 +74,7 @@ def check(recording: Recording) -> list[Finding]:
 
 
 def _unlike(recording: Recording) -> list[Finding]:
-    """Where the rotors carry far more or less than the weight of the vehicle that the commands would take."""
+    """Finding if the thrust of the rotors does not fit the weight of the vehicle that commands would use."""
     vehicle, air = vehicle_for(recording), airtime(recording)
     why = weight_objection(recording, vehicle, air)
     if not why:
@@ -95,9 +95,9 @@ def claimed_mass(recording: Recording) -> float | None:
 
 
 def apparent_mass(recording: Recording, vehicle: Vehicle) -> Carried | None:
-    """Mean thrust by a vehicle's law over mean specific force along body z, in flight; None where it cannot be had.
+    """Mean thrust by a vehicle's law over mean specific force along body z, in flight; None without enough data.
 
-    Without an accelerometer the mean force is taken to be the weight.
+    Without an accelerometer the mean force is assumed to be the weight.
     """
     made = _thrust(recording, vehicle)
     if made is None:
@@ -128,7 +128,7 @@ def apparent_mass(recording: Recording, vehicle: Vehicle) -> Carried | None:
 
 
 def _thrust(recording: Recording, vehicle: Vehicle) -> tuple[Grid, Track, Track] | None:
-    """Total thrust (m, 1) [N] and voltage (m, 1) on a grid: from rotor speeds where the law has them."""
+    """Total thrust (m, 1) [N] and voltage (m, 1) on a grid, from rotor speeds if possible, else from the duty."""
     speed = next(iter(measurements(recording, "rotor_speed").values()), None)
     voltage = next(iter(measurements(recording, "voltage").values()), None)
     if speed is not None and vehicle.rotor_constant is not None:
