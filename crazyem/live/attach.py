@@ -27,10 +27,10 @@ class OpenCrazyflie(Protocol):
 
 
 class Attachment:
-    """Runs beside a flight until closed; a context manager.
+    """An estimation beside a flight of another script, until closed; a context manager.
 
     Attributes:
-        session: everything underneath (history, pushes, clock).
+        session: holds history, pushes and clock.
     """
 
     def __init__(self, session: Session) -> None:
@@ -44,11 +44,11 @@ class Attachment:
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """What the monitor found in this flight so far."""
+        """Faults that the monitor has found in this flight."""
         return self.session.history.faults
 
     def wait(self, parameters: Sequence[str] = ("mass",), *, timeout: float = 30.0) -> Estimate:
-        """Block until all of `parameters` are identifiable; returns that estimate.
+        """Block until all of `parameters` are identifiable, and return the estimate.
 
         Raises:
             DataError: not within `timeout` seconds, with the reason.
@@ -66,9 +66,9 @@ class Attachment:
         raise DataError(f"no identifiable {' and '.join(parameters)} within {timeout:g} s ({why}).")
 
     def close(self) -> None:
-        """End the writes first, then remove our log blocks; the Crazyflie object stays open, the flight goes on.
+        """End the writes, then remove our log blocks; the Crazyflie object stays open and the flight goes on.
 
-        The estimator finishes what has arrived by then; nothing of that is written to the drone.
+        The estimator finishes the received samples; this last estimate is not written to the drone.
         """
         try:
             self.session.close()
@@ -106,14 +106,14 @@ def attach(
     Args:
         cf: an open, connected cflib Crazyflie (`scf.cf` of a SyncCrazyflie).
         vehicle: preset name, path of a vehicle file, or a Vehicle.
-        push: let the guard tell the controller that runs, and the onboard filter, what they take of it.
-        policy: of the guard: a file's path or a Policy; None is the shipped one. What was pushed stays in the drone
-            when the attachment ends: the flight is the script's.
-        dry_run: with `push`, decide and tell (`session.history.guard`), but write nothing.
-        window, every: newest samples used, samples per update.
-        monitor: whether faults in flight are looked for; None: as the policy says.
+        push: let the guard write estimates to the active controller and the onboard filter.
+        policy: of the guard: path of a file or a Policy; None: the shipped one. Pushed values stay in the drone when
+            the attachment ends, because the script owns the flight.
+        dry_run: with `push`, make decisions (`session.history.guard`), but write nothing.
+        window: samples in the window of the estimator. every: samples per update.
+        monitor: whether to monitor faults in flight; None: as the policy says.
         false_alarms_per_hour: of the monitor; None: as the policy says.
-        on_fault: called with every report of the monitor, in the estimator's thread; must return at once.
+        on_fault: called with every report of the monitor in the estimator's thread; must return at once.
 
     Raises:
         UsageError: unknown vehicle, no such policy, not connected, or a log variable is missing. LinkError: no answer.

@@ -1,4 +1,4 @@
-"""What a controller or the onboard filter believes about the drone, and how its parameters hold that."""
+"""Beliefs: values of mass, inertia, lag or drag that a controller or the onboard filter uses, and their parameters."""
 
 import math
 from collections.abc import Mapping
@@ -10,18 +10,19 @@ from crazyem.physics.effects.rotors import ROTOR_INERTIA
 from crazyem.vehicle import GRAVITY, Vehicle
 
 Form = Literal["proportional", "reciprocal", "lag"]
-NOMINAL_VOLTS = 3.7  # V; nothing here depends on it where the firmware compensates the voltage
+NOMINAL_VOLTS = 3.7  # V; without effect if the firmware compensates the voltage
 INERTIA_NAMES = ("Ixx", "Iyy", "Izz")
 DRAG_NAMES = ("drag_x", "drag_y")
 
 
 @dataclass(frozen=True)
 class Slot:
-    """A firmware parameter and the estimate that it holds.
+    """A firmware parameter and its relation to an estimate.
 
     Attributes:
-        parameter: its name. form, scale: the parameter is estimate / scale (proportional), scale / estimate
-            (reciprocal), or the share of a time constant's way in one period of INDI's loop (lag).
+        parameter: its name.
+        form, scale: the parameter is estimate / scale (proportional), scale / estimate (reciprocal), or the filter
+            coefficient of a time constant in one period of INDI's loop (lag).
     """
 
     parameter: str
@@ -29,7 +30,7 @@ class Slot:
     scale: float = 1.0
 
     def value(self, estimate: float) -> float:
-        """The parameter's value that holds an estimate [SI]."""
+        """The parameter's value for an estimate [SI]."""
         if self.form == "lag":
             return lag_share(estimate)
         if self.form == "reciprocal":
@@ -37,7 +38,7 @@ class Slot:
         return estimate / self.scale
 
     def estimate(self, value: float) -> float:
-        """The estimate [SI] that a parameter's value holds."""
+        """The estimate [SI] for a parameter's value."""
         if self.form == "lag":
             return lag_of(value)
         if self.form == "reciprocal":
@@ -47,25 +48,25 @@ class Slot:
 
 @dataclass(frozen=True)
 class Belief:
-    """One estimate and every parameter that follows it, the one it is read from first."""
+    """One estimate and all parameters that depend on it; the estimate is read from the first one."""
 
     name: str
     slots: tuple[Slot, ...]
 
     def read(self, values: Mapping[str, float]) -> float:
-        """What is believed [SI], from parameter values."""
+        """The believed value [SI], from parameter values."""
         first = self.slots[0]
         return first.estimate(values[first.parameter])
 
     def writes(self, estimate: float) -> tuple[tuple[str, float], ...]:
-        """Parameters and values that hold an estimate [SI]."""
+        """Parameters and their values for an estimate [SI]."""
         return tuple((slot.parameter, slot.value(estimate)) for slot in self.slots)
 
 
 def indi_beliefs(vehicle: Vehicle) -> tuple[Belief, ...]:
-    """Inertia as control effectiveness g1 = torque of a unit / inertia, g2 where the rotors' inertia is known, lag.
+    """Beliefs of INDI: g1 = torque of a command unit / inertia, g2 if the rotors' inertia is known, and the lag.
 
-    Raises: ValueError: one sentence on what the vehicle file lacks.
+    Raises: ValueError: one sentence about the missing entry of the vehicle file.
     """
     torque = effectiveness_torque(vehicle)
     slots = [[Slot(f"ctrlINDI.g1_{axis}", "reciprocal", t)] for axis, t in zip("pqr", torque)]
@@ -77,9 +78,9 @@ def indi_beliefs(vehicle: Vehicle) -> tuple[Belief, ...]:
 
 
 def mass_thrust_belief(vehicle: Vehicle) -> tuple[Belief, float]:
-    """Mellinger's massThrust and the value [1/N] that makes ctrlMel.mass a mass.
+    """Mellinger's massThrust, and its value [1/N] with which ctrlMel.mass is the mass in kg.
 
-    Raises: ValueError: one sentence on what the vehicle file lacks.
+    Raises: ValueError: one sentence about the missing entry of the vehicle file.
     """
     value = mass_thrust(vehicle, force=vehicle.mass * GRAVITY, volts=NOMINAL_VOLTS)
     return Belief("mass_thrust", (Slot("ctrlMel.massThrust"),)), value

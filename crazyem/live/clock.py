@@ -1,4 +1,4 @@
-"""Firmware time as the host can know it: a line through the arrival times of log packets, followed without jumps."""
+"""Firmware time on the host: a line through the arrival times of log packets, followed without jumps."""
 
 import statistics
 import threading
@@ -6,20 +6,20 @@ import time
 from collections import deque
 from itertools import pairwise
 
-SEGMENT = 0.5  # s of host time; the rate is the median slope of the newest SEGMENTS of these
-SEGMENTS = 8
-OFFSET_SPAN = 0.5  # s over which the promptest packet is looked for
-SLEW = 0.2  # largest relative departure from the measured rate while catching up
-LARGEST_CATCH_UP = 3.0  # s of firmware time beyond which catching up is given up
+SEGMENT = 0.5  # s of host time, length of a segment
+SEGMENTS = 8  # number of newest segments; the rate is the median of their slopes
+OFFSET_SPAN = 0.5  # s of packets; the one with the least delay gives the offset
+SLEW = 0.2  # largest relative deviation from the measured rate during a correction
+LARGEST_CATCH_UP = 3.0  # s of firmware time; a larger error is corrected by a jump
 
 
 class FirmwareClock:
-    """Predicts the drone's clock from packet stamps, so that setpoints keep its time, not the host's.
+    """Predicts the drone's clock from packet stamps, so that setpoints follow the drone's time, not the host's.
 
-    A simulator may run faster or slower than real time and any drone's crystal drifts, so the rate is measured: the
-    slope over the last seconds of packets. The offset is that of the promptest recent packet, because delays only add.
-    A simulator, or this process, that was denied the processor for a while leaves the prediction wrong by that while;
-    the error is made good by running a little slow or fast, because a setpoint that freezes or jumps shakes the drone.
+    The rate is measured over the last seconds of packets: a simulator may run faster or slower than real time, and
+    crystals drift. The offset is that of the recent packet with the least delay, because delays are never negative. If
+    the simulator or this process does not run for a while, the prediction is wrong by this time. The clock then runs a
+    little slow or fast until the error is gone, because a setpoint that stops or jumps shakes the drone.
     """
 
     def __init__(self) -> None:
@@ -39,21 +39,21 @@ class FirmwareClock:
             if not firmware_time <= self.newest:  # also the first, while newest is NaN
                 self.newest = firmware_time
             if self._pairs and host - self._pairs[-1][0] < 0.002:
-                return  # four blocks of a 100 Hz log would otherwise weigh a burst as heavily as time
+                return  # one packet of a burst is enough
             self._pairs.append((host, firmware_time))
             while self._pairs[-1][0] - self._pairs[0][0] > OFFSET_SPAN:
                 self._pairs.popleft()
             self._measure_rate(host, firmware_time)
-            self._stale = True  # the line is drawn when it is asked for: packets are many, and watching asks for none
+            self._stale = True  # the line is computed on demand only: packets are frequent
 
     def _draw_line(self) -> None:
-        """Through the promptest packet of the last while, with the measured rate."""
+        """Compute the line through the recent packet with the least delay, with the measured rate."""
         newest = self._pairs[-1][0]
         self._line = (newest, max(f - self._rate * (h - newest) for h, f in self._pairs))
         self._stale = False
 
     def _measure_rate(self, host: float, firmware_time: float) -> None:
-        """Median slope of half seconds, which one stall cannot bend; the overall slope while there are too few."""
+        """Median slope of the segments, robust against one stall; the overall slope while there are too few."""
         posts = self._posts
         if not posts or host - posts[-1][0] >= SEGMENT:
             posts.append((host, firmware_time))
@@ -74,7 +74,7 @@ class FirmwareClock:
         with self._lock:
             if self._stale:
                 self._draw_line()
-            # No packet, no progress: do not extrapolate for ever when the drone falls silent.
+            # Extrapolate for at most 1 s without a packet.
             ahead = min(host - self._line[0], 1.0)
             value = self._line[1] + self._rate * ahead
             if self._shown is not None:

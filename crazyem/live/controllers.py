@@ -1,4 +1,4 @@
-"""What each firmware controller believes about the drone, and the parameter writes that tell it better, in order."""
+"""Beliefs of each firmware controller about the drone, and the ordered parameter writes that change them."""
 
 import math
 from collections.abc import Collection, Mapping
@@ -13,20 +13,20 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True)
 class Controller:
-    """A controller of the firmware and where its mass and inertia live.
+    """A controller of the firmware and the parameters of its mass and inertia.
 
     Attributes:
         name: as on the command line.
         number: value of the parameter stabilizer.controller.
-        mass: parameter that holds the believed mass [kg], "" if it takes none.
-        inertia: parameters that hold the believed principal inertia [kg m^2], empty if it takes none.
-        attitude_gains: for each axis, (proportional, derivative) gain parameters in absolute N m/rad and N m s/rad
-            that have to be scaled with the inertia, empty if gains are per unit of inertia already.
-        others: what it believes besides, or the onboard filter does.
+        mass: parameter of the believed mass [kg], "" if the controller has none.
+        inertia: parameters of the believed principal inertia [kg m^2], empty if the controller has none.
+        attitude_gains: for each axis, (proportional, derivative) gain parameters in absolute N m/rad and N m s/rad,
+            which are scaled with the inertia; empty if gains are per unit of inertia.
+        others: other beliefs of the controller or of the onboard filter.
         wrench: log group of its commanded thrust and torque, "" if it logs none in SI units.
-        note: what a user has to know about pushing to it.
-        known: estimates that the vehicle file gives rather than the flight, such as mass_thrust [1/N].
-        incremental: whether it believes control effectiveness: the loop gain itself (INDI).
+        note: for the user, about pushing to this controller.
+        known: estimates from the vehicle file, not from the flight, such as mass_thrust [1/N].
+        incremental: whether the controller uses control effectiveness, which is the loop gain (INDI).
     """
 
     name: str
@@ -39,22 +39,22 @@ class Controller:
     note: str = ""
     known: tuple[tuple[str, float], ...] = ()
     incremental: bool = False
-    mass_scale: float = 1.0  # kg a unit of the mass parameter, where that is not a mass (see crazyem.live.hover_thrust)
+    mass_scale: float = 1.0  # kg per unit of the mass parameter, if it is not a mass (see crazyem.live.hover_thrust)
     persistent: bool = False  # whether parameters outlive a restart of the firmware
 
     @property
     def beliefs(self) -> tuple[Belief, ...]:
-        """Everything it believes."""
+        """All beliefs of the controller."""
         mass = (Belief("mass", (Slot(self.mass, scale=self.mass_scale),)),) if self.mass else ()
         inertia = tuple(Belief(name, (Slot(p),)) for name, p in zip(INERTIA_NAMES, self.inertia))
         return (*mass, *inertia, *self.others)
 
     @property
     def waits(self) -> Mapping[str, tuple[str, ...]]:
-        """Estimate -> those it is written together with: one alone would skew a gain that they share.
+        """Estimate -> other estimates that are written together with it, because they share a gain.
 
-        Scaled gains of roll and pitch share one scale. INDI's loop gain holds for roll and pitch alike, and a lag that
-        comes with a wrong inertia is wrong as well.
+        Attitude gains of roll and pitch have one scale. INDI's loop gain depends on roll and pitch inertia, and a lag
+        that is estimated with a wrong inertia is wrong, too.
         """
         if not (self.attitude_gains or self.incremental):
             return {}
@@ -68,8 +68,8 @@ class Controller:
         return held + tuple(g for pair in self.attitude_gains for g in pair)
 
 
-# ctrlLee.J_* enters only the small term omega x J omega, the attitude gains are absolute torques: without scaling the
-# gains a new inertia would change next to nothing (controller_lee.c).
+# ctrlLee.J_* appears only in the small term omega x J omega, and the attitude gains are absolute torques. So a new
+# inertia has almost no effect unless the gains are scaled (controller_lee.c).
 LEE = Controller(
     "lee",
     5,
@@ -86,7 +86,7 @@ CONTROLLER_NAMES = {0: "auto", 1: "PID", 2: "Mellinger", 3: "INDI", 4: "Brescian
 
 
 def for_vehicle(controller: Controller, vehicle: Vehicle) -> Controller | str:
-    """The controller with what it can be told of this vehicle, or one clause why it can be told nothing."""
+    """The controller with the beliefs that this vehicle allows, or one clause why there are none."""
     if controller.number == INDI.number:
         try:
             return replace(controller, others=indi_beliefs(vehicle))
@@ -104,7 +104,7 @@ def for_vehicle(controller: Controller, vehicle: Vehicle) -> Controller | str:
 
 
 def with_drag(controller: Controller) -> Controller:
-    """The controller and the onboard filter's drag beside it."""
+    """The controller with the drag of the onboard filter among its beliefs."""
     return replace(controller, others=controller.others + drag_beliefs())
 
 
@@ -120,12 +120,12 @@ def controller_named(name: str) -> Controller:
     raise UsageError(f"unknown controller '{name}' (choose {', '.join(c.name for c in CONTROLLERS.values())}).")
 
 
-# What Lee, LQG, Mellinger or INDI could be told, for a controller that takes nothing.
+# For the message about a controller that takes no estimates: the alternatives.
 _SWITCHING = "Lee takes mass and inertia, Mellinger mass and thrust scale, INDI control effectiveness and rotor lag"
 
 
 def without_target(number: int) -> str:
-    """One sentence for a controller that takes nothing."""
+    """One sentence about a controller that takes no estimates."""
     name = CONTROLLER_NAMES.get(number, f"number {number}")
     why = "takes no mass or inertia"
     if number == 1:
@@ -142,15 +142,15 @@ def writes_for(
     beliefs: Mapping[str, float],
     originals: Mapping[str, float],
 ) -> tuple[tuple[str, float], ...]:
-    """Parameter writes, in a safe order, that make the controller believe new values.
+    """Parameter writes, in a safe order, that change beliefs of the controller.
 
-    Attitude gains keep the closed-loop poles: they are scaled by new inertia over the inertia at connect, roll and
-    pitch together by their mean. When stiffness rises the damping gain goes first, when it falls the stiffness does,
-    so that a half-done set is never less damped than either end.
+    Attitude gains are scaled by the new inertia over the inertia at connect, so the closed-loop poles stay the same;
+    roll and pitch are scaled together by their mean. If the stiffness rises, the damping gain is written first; if it
+    falls, the stiffness is. So an incomplete set is never less damped than the old or the new gains.
 
     Args:
-        changed: estimates [SI] that are to change: mass, Ixx, Iyy, Izz, ...
-        beliefs: all of the controller's as it believes them now.
+        changed: new estimates [SI]: mass, Ixx, Iyy, Izz, ...
+        beliefs: all present beliefs of the controller.
         originals: parameter values at connect.
     """
     now = {**beliefs, **changed}
@@ -175,7 +175,7 @@ def writes_for(
     return tuple(writes)
 
 
-EQUAL_WITHIN = 1e-6  # relative difference of values that is none: sixteen steps of the firmware's floats
+EQUAL_WITHIN = 1e-6  # largest relative difference of equal values: sixteen steps of the firmware's floats
 
 
 def writes_back(
@@ -185,12 +185,12 @@ def writes_back(
     now: Mapping[str, float],
     uncertain: Collection[str] = (),
 ) -> tuple[tuple[str, float], ...]:
-    """Parameter writes that lead from the values `now` to those of `target`, safe at every step like `writes_for`.
+    """Parameter writes from the values `now` to those of `target`, in a safe order like `writes_for`.
 
     Args:
-        target: firmware parameter -> value; what is not in it is left as it is.
-        now: what the drone holds, as far as known; NaN where not.
-        uncertain: written even if `now` is equal, because that value was never confirmed.
+        target: firmware parameter -> value; other parameters are not written.
+        now: values in the drone; NaN if unknown.
+        uncertain: parameters to write even if `now` is equal, because this value was not confirmed.
     """
 
     def differs(name: str) -> bool:
@@ -208,11 +208,11 @@ def writes_back(
 
 
 def _ordered(controller: Controller, target: Mapping[str, float], now: Mapping[str, float]) -> list[str]:
-    """Names of `target` in an order in which every state on the way is safe; attitude gains have their own.
+    """Names of `target` in an order with safe intermediate states; attitude gains are ordered elsewhere.
 
-    INDI: first what makes a loop slower (act_dyn that falls), then g1 that rises and g2, then g1 that falls, and last
-    what makes a loop faster. Mellinger: of mass and massThrust first the one after which their product, the thrust, is
-    nearer to the thrust in the end.
+    INDI: first a falling act_dyn, which makes the loop slower, then a rising g1 and g2, then a falling g1, and last a
+    rising act_dyn. Mellinger: the thrust is the product of mass and massThrust; first the one that brings the thrust
+    nearer to its final value.
     """
     names = list(target)
     if controller.incremental:
@@ -224,11 +224,11 @@ def _ordered(controller: Controller, target: Mapping[str, float], now: Mapping[s
 
 
 def _caution(name: str, *, rising: bool) -> int:
-    """Place of a parameter of INDI in the order of writes; g2 moves while g1_r is the larger of its two values."""
+    """Rank of an INDI parameter in the order of writes; g2 changes while g1_r has the larger of its two values."""
     if "act_dyn" in name:
         return 5 if rising else 0
     if name.endswith(".g2"):
         return 2 if rising else 3
     if ".g1_" in name:
         return 1 if rising else 4
-    return 6  # of the filter
+    return 6  # parameters of the onboard filter

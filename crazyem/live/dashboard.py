@@ -1,6 +1,6 @@
-"""The live view in a terminal: drones as a table, one of them in full; a thread of its own draws frozen snapshots.
+"""The live view in a terminal: a table of drones, and details of one; its own thread draws frozen snapshots.
 
-Drawing never delays a flight: it takes no lock of the session's, and if a terminal is slow only this thread waits.
+Drawing never delays a flight: it takes no lock of the session, and only this thread waits for a slow terminal.
 """
 
 import contextlib
@@ -19,17 +19,17 @@ from rich.text import Text
 from crazyem.live.keys import Keys
 from crazyem.live.views import NOT_PUSHED, ParameterView, Snapshot
 
-# s between pictures; drones from which they are rarer: each costs some ms
+# s between pictures, and the same for many drones; number of drones that counts as many: each costs some ms
 FRAME_PERIOD, FRAME_PERIOD_OF_MANY, MANY_DRONES = 0.25, 1.0, 8
 BARS = "▁▂▃▄▅▆▇█"
 HELP = "p push on/off   r revert   m mark   l land   q quit view   Ctrl-C land all, twice: cut"
 CHOOSE = "↹ next drone   "
 LOW_VOLTAGE = 3.3  # V, shown in red
-HIGH_LOSS = 0.05
+HIGH_LOSS = 0.05  # share of lost packets, shown in red
 
 
 class Controls(Protocol):
-    """What keys do to one drone; each returns one sentence for the status line."""
+    """Actions of keys on one drone; each returns one sentence for the status line."""
 
     def toggle_push(self) -> str: ...
     def revert(self) -> str: ...
@@ -38,23 +38,23 @@ class Controls(Protocol):
 
 
 def sparkline(values: Sequence[float], width: int = 24) -> str:
-    """Newest `width` values as bars between their least and largest; a flat line where they hardly differ."""
+    """Newest `width` values as bars between their least and largest; a flat line if they hardly differ."""
     shown = [v for v in values if math.isfinite(v)][-width:]
     if not shown:
         return ""
-    low, high = min(shown) / 2, max(shown) / 2  # halves, as the whole span may be beyond the largest number
+    low, high = min(shown) / 2, max(shown) / 2  # halves, because the whole span may overflow
     if high - low <= 1e-3 * max(abs(low), abs(high)):
         return BARS[3] * len(shown)
     return "".join(BARS[min(int((v / 2 - low) / (high - low) * len(BARS)), len(BARS) - 1)] for v in shown)
 
 
 def number(value: float, digits: int = 2) -> str:
-    """A number, or a dash where none is known."""
+    """A number, or a dash if it is not finite."""
     return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
 def safe(text: str, style: str = "") -> Text:
-    """Text as it is: no markup, and nothing that steers a terminal, whoever wrote it."""
+    """Text without markup and without control characters."""
     return Text("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text), style=style)
 
 
@@ -70,7 +70,7 @@ def _interval(p: ParameterView) -> str:
 
 
 def parameter_table(parameters: Sequence[ParameterView]) -> RenderableType:
-    """Values with intervals and trend; what cannot be identified says why."""
+    """Table of values with intervals and trend, and the reason if a value is not identifiable."""
     if not parameters:
         return Text("no estimate yet: the drone has not flown", style="dim")
     table = Table(box=None, pad_edge=False, expand=True)
@@ -91,7 +91,7 @@ def parameter_table(parameters: Sequence[ParameterView]) -> RenderableType:
 
 
 def link_text(s: Snapshot) -> Text:
-    """One line on the link."""
+    """One line about the link."""
     link = s.link
     if link.gone:
         return Text("link lost", style="bold red")
@@ -106,7 +106,7 @@ def link_text(s: Snapshot) -> Text:
 
 
 def guard_text(s: Snapshot) -> Text:
-    """One line on the guard: its mode, and what it does or why it does nothing."""
+    """One line about the guard: its mode, and its last decision or why it writes nothing."""
     if not s.guard:
         return Text(NOT_PUSHED, style="dim")
     if s.stopped:
@@ -146,7 +146,7 @@ def _status(s: Snapshot) -> Text:
 
 
 def detail(s: Snapshot) -> Panel:
-    """One drone in full."""
+    """All details of one drone."""
     facts = Table.grid(padding=(0, 2))
     facts.add_column(style="dim", no_wrap=True)
     facts.add_column()
@@ -212,10 +212,10 @@ class Dashboard:
     """Draws until closed, or until the user presses q; a context manager.
 
     Args:
-        snapshots: makes the present ones; called in the dashboard's thread. An exception there ends the view, not the
-            flight.
-        controls: of each drone, in the order of the snapshots; called when keys ask for something.
-        console: where to draw. keys: where they come from.
+        snapshots: gives the present snapshots; called in the dashboard's thread. An exception in it ends the view, not
+            the flight.
+        controls: gives the controls of each drone, in the order of the snapshots; called when a key is pressed.
+        console: to draw on. keys: source of keys.
     """
 
     def __init__(
@@ -239,7 +239,7 @@ class Dashboard:
 
     @property
     def showing(self) -> bool:
-        """Whether the view is there; plain lines take its place otherwise."""
+        """Whether the view is running; if not, plain lines are printed."""
         return self._thread.is_alive() and not self._stop.is_set()
 
     def __enter__(self) -> "Dashboard":
@@ -251,7 +251,7 @@ class Dashboard:
         self.close()
 
     def close(self) -> None:
-        """End the view and put the terminal back; returns when that is done, or cannot be waited for."""
+        """End the view and restore the terminal; waits for the thread for at most 3 s."""
         self._stop.set()
         if self._thread.ident is not None and threading.current_thread() is not self._thread:
             self._thread.join(timeout=3.0)
@@ -266,7 +266,7 @@ class Dashboard:
                 while not self._stop.is_set():
                     many = self._draw(live) >= MANY_DRONES
                     self._wait(FRAME_PERIOD_OF_MANY if many else FRAME_PERIOD)
-        except Exception as error:  # a view that fails must not take a flight with it
+        except Exception as error:  # a failed view must not end a flight
             self.failure = f"the live view ended: {error!r}."
         finally:
             self._stop.set()
@@ -288,7 +288,7 @@ class Dashboard:
         return len(snapshots)
 
     def _wait(self, seconds: float) -> None:
-        """Until the next picture is due, or a key was pressed."""
+        """Wait until the next picture is due or a key is pressed."""
         if not self.keys.reading:
             self._stop.wait(seconds)
             return
@@ -297,7 +297,7 @@ class Dashboard:
             self.press(key)
 
     def press(self, key: str) -> None:
-        """What a key does."""
+        """Carry out the action of a key."""
         if key in ("q", "Q"):
             self._stop.set()
             return

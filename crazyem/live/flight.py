@@ -1,4 +1,4 @@
-"""One flight from connect to landed: controller, arming, take-off, trajectory, landing, and every way out of it."""
+"""One flight: selection of the controller, arming, take-off, trajectory, landing, and the handling of every failure."""
 
 import contextlib
 import math
@@ -16,10 +16,10 @@ from crazyem.live.stream import SetpointStream
 from crazyem.live.telemetry import ARMED, CAN_FLY, FLYING, Telemetry
 from crazyem.live.write_supervisor import WriteRules
 
-BASELINE_SECONDS = 3.0  # s of hover before anything is pushed: shows what the drone does with what it believes now
-CONFIRMED_WITHIN = 0.25  # s; without setpoints the drone levels out after 0.5 s
+BASELINE_SECONDS = 3.0  # s of hover before the first push: shows the behaviour with the present parameters
+CONFIRMED_WITHIN = 0.25  # s to confirm the plan to land; without setpoints the drone levels out after 0.5 s
 PACKET_REORDER_SECONDS = 0.15  # s of host time by which packets may overtake one another
-HAND_OVERS, HAND_OVER_EVERY = 3, 0.04  # times that the drone is handed back to land, s between them
+HAND_OVERS, HAND_OVER_EVERY = 3, 0.04  # repetitions of the hand-over for the landing; s between them
 LOST_AFTER_SILENCE = 3.0  # s of host time without a packet after which the drone counts as lost
 REPORT_EVERY = 1.0  # s of host time between reports of progress
 
@@ -34,7 +34,7 @@ class MotorsCutError(Exception):
 
 @dataclass
 class Interrupts:
-    """Counts the user's Ctrl-C; the flight looks at it wherever it waits."""
+    """Counts the user's Ctrl-C; the flight checks the count whenever it waits."""
 
     count: int = 0
 
@@ -47,11 +47,11 @@ class FlightPlan:
     """What to fly.
 
     Attributes:
-        trajectory: made from the hover point [m, world] and heading [rad] at which it begins.
+        trajectory: makes the trajectory from the hover point [m, world] and heading [rad] at its beginning.
         controller: of the firmware.
         height: of the hover above the take-off point, m.
-        push: whether estimates go to the controller.
-        rules: how they do (policy, dry run, confirmation); None: the shipped policy.
+        push: whether estimates are written to the controller.
+        rules: of these writes (policy, dry run, confirmation); None: the shipped policy.
         baseline: s of hover before pushes and before the trajectory.
     """
 
@@ -64,9 +64,9 @@ class FlightPlan:
 
 
 def select_controller(link: Link, controller: Controller) -> None:
-    """Make the firmware run `controller`, verified by a fresh read: the firmware overrules silently.
+    """Make the firmware run `controller`, and verify by a fresh read: the firmware may refuse silently.
 
-    Raises: UsageError: this firmware does not have it. LinkError: no answer.
+    Raises: UsageError: the firmware does not have this controller. LinkError: no answer.
     """
     if "stabilizer.controller" not in link.parameters:
         raise UsageError("the drone has no parameter stabilizer.controller.")
@@ -93,7 +93,7 @@ class Flight:
         session: connected link with packets flowing.
         plan: what to fly.
         interrupts: the user's Ctrl-C.
-        progress: called about every second of host time with (phase, seconds of firmware time in it).
+        progress: called about every second of host time with the phase and the seconds of firmware time in it.
     """
 
     def __init__(
@@ -124,11 +124,11 @@ class Flight:
         return self.session.telemetry
 
     def fly(self) -> None:
-        """Take off, fly, land. Whatever happens, the drone is brought down before this returns or raises.
+        """Take off, fly, land. In every case the drone is brought down before this returns or raises.
 
         Raises:
-            FlightInterruptedError: the user landed it. MotorsCutError: the user cut the motors.
-            LinkError: the drone is gone. CrazyemError: anything else that ended the flight early (it has landed).
+            FlightInterruptedError: the user landed the drone. MotorsCutError: the user cut the motors.
+            LinkError: the link is lost. CrazyemError: another reason ended the flight early (the drone has landed).
         """
         try:
             self._prepare()
@@ -144,7 +144,7 @@ class Flight:
                 else:
                     self._bring_down()
             finally:
-                # Only now, on the ground or with the motors off, may parameters jump.
+                # Parameters may jump only on the ground or with the motors off.
                 self.session.end_pushing(self._outcome(error))
             raise
 
@@ -176,7 +176,7 @@ class Flight:
             self.link.arm(True)
             self._wait(lambda: telemetry.has(ARMED), 5.0, "the drone does not arm")
         self._wait(lambda: telemetry.has(CAN_FLY), 5.0, "the drone says it cannot fly")
-        # A client that left earlier may have locked out the high-level commander (its last packet is a setpoint).
+        # The last packet of an earlier client may be a setpoint, which locks out the high-level commander.
         self.link.release_setpoints()
 
     def _take_off(self) -> None:
@@ -185,7 +185,7 @@ class Flight:
         yaw = self.telemetry.yaw
         self.start: Vector = (x, y, self._ground + self.plan.height)
         self.heading = yaw
-        # Made before anything spins: a file that cannot be flown must not be found out in the air.
+        # Made before the motors start: an error in a trajectory file must not appear in the air.
         self.path = self.plan.trajectory(self.start, yaw)
         self._enter("taking off")
         self._may_fly = True
@@ -218,12 +218,12 @@ class Flight:
         self._mark("trajectory_end", self.session.clock.newest)
 
     def _land(self) -> None:
-        """Hand back to the high-level commander, land, and make sure that it has."""
+        """Hand over to the high-level commander, land, and check that the drone has landed."""
         self.session.stop_pushing()
         self._enter("landing")
-        # What is sent into an outage is lost, and a second Ctrl-C still cuts.
+        # Packets sent during an outage are lost, so wait; a second Ctrl-C still cuts the motors.
         self._wait(lambda: not self.session.reconnecting, math.inf)
-        self.session.pipeline.push_until = -math.inf  # the watch on the writes ends, too
+        self.session.pipeline.push_until = -math.inf  # also ends the monitoring of writes
         self.session.end_estimates()
         if self._stream is not None:
             self._stream.stop()
@@ -247,17 +247,20 @@ class Flight:
         self._enter("landed")
 
     def _let_setpoints_arrive(self) -> None:
-        """One that came after the plan to land would make the drone forget it, and the release then stop the motors."""
+        """Wait for setpoints on their way: one that arrives after the plan to land would cancel the plan.
+
+        The release of setpoints would then stop the motors.
+        """
         # an accelerated simulator's drone levels out after 0.5 s of its own time without setpoints
         until = time.monotonic() + PACKET_REORDER_SECONDS / max(1.0, self.session.clock.rate / 3.0)
         self._wait(lambda: time.monotonic() >= until, math.inf)
 
     def _hand_over(self, duration: float) -> None:
-        """The drone to the high-level commander, with a plan to land.
+        """Hand the drone over to the high-level commander, with a plan to land.
 
-        The plan comes first: a release that arrives without one stops the motors, and nothing says what arrived. So
-        both are sent three times; a plan that begins anew does no harm, and 2 s without a release would drop the drone.
-        A link that can ask whether the plan arrived does so first.
+        The plan is sent before the release of setpoints: a release without a plan stops the motors. It is not known
+        which packets arrive, so both are sent three times. A repeated plan does no harm; without a release the drone
+        drops after 2 s. A link that can confirm the plan does so first.
         """
         link = self.link
         if isinstance(link, ConfirmingLink) and link.land_and_confirm(self._ground, duration, timeout=CONFIRMED_WITHIN):
@@ -276,7 +279,7 @@ class Flight:
     # ways out
 
     def _bring_down(self) -> None:
-        """After any failure: land while somebody answers, else cut, so that nothing of ours keeps it up."""
+        """After any failure: land if the drone answers, else cut the motors."""
         if self._stream is not None:
             self._stream.stop()
         if not self._may_fly:
@@ -285,7 +288,7 @@ class Flight:
         fell = self.session.outages and self.telemetry.grounded_reason()
         if self.session.lost is None and not fell:
             flew = self.telemetry.has(FLYING) or self.telemetry.height > self._ground + 0.1
-            for _ in range(2):  # a Ctrl-C that arrives while landing is the second one: cut
+            for _ in range(2):  # a Ctrl-C during the landing is the second one: cut
                 try:
                     self._land()
                     notice(
@@ -328,7 +331,10 @@ class Flight:
         self._wait(lambda: self.session.clock.newest >= until, math.inf)
 
     def _wait(self, done: Callable[[], bool], seconds: float, otherwise: str = "") -> None:
-        """Until `done()`, at most `seconds` of firmware time; looks after everything that may end a flight."""
+        """Wait until `done()`, at most `seconds` of firmware time, and check everything that may end a flight.
+
+        Raises: CrazyemError: the time is over; `otherwise` says why.
+        """
         clock = self.session.clock
         begun = clock.newest
         while not done():
@@ -367,5 +373,5 @@ class Flight:
 
 
 def clock_seconds(now: float, start: float) -> float:
-    """Seconds in a phase, 0 where unknown."""
+    """Seconds in a phase, 0 if unknown."""
     return now - start if math.isfinite(now - start) else 0.0

@@ -1,6 +1,6 @@
-"""The monitor in a session: it sees what the estimator filters, says what changed, and stops pushing when it must.
+"""The fault monitor of a session: it reads the innovations of the estimator, reports faults, and stops pushing.
 
-Called in the estimator's thread, like the pipeline. Nothing here reads a clock: a replay finds the same faults.
+It runs in the estimator's thread, like the pipeline. It reads no clock, so a replay finds the same faults.
 """
 
 import json
@@ -23,19 +23,19 @@ from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle
 
 REPEATING = ("position", "velocity", "attitude", "body_rate")  # signals that a stuck sensor would repeat
-MOST_FAULTS = 1000  # that are kept
-SHARE_OF_RUNS = 0.1  # of the false alarms, for the tests of repetition; the rest is the detector's
+MOST_FAULTS = 1000  # most faults that are kept
+SHARE_OF_RUNS = 0.1  # share of the false alarms for the tests of repetition; the rest is for the detector
 
 
 def event_lines(fault: Fault) -> tuple[str, str]:
-    """What a recording's events say of a fault: a sentence, and the same for programs."""
+    """Two events about a fault for the recording: a sentence, and the same as JSON."""
     return f"fault: {fault}", f"fault_data {json.dumps(finite(fault.to_json()))}"
 
 
 def monitor_for(
     vehicle: Vehicle, rules: FaultRules, *, enabled: bool | None = None, false_alarms_per_hour: float | None = None
 ) -> "FlightMonitor | None":
-    """The monitor of a flight as the policy says, None where there is none; the arguments overrule the policy."""
+    """The monitor by the policy, None if it is disabled; the arguments take precedence over the policy."""
     if not (rules.enabled if enabled is None else enabled):
         return None
     if false_alarms_per_hour is not None:
@@ -47,11 +47,11 @@ class FlightMonitor:
     """Watches one flight.
 
     Args:
-        vehicle: nominal constants. rules: what follows a fault, and how often it may be a false alarm.
-        on_fault: called with every report, from the estimator's thread.
+        vehicle: nominal constants. rules: the action after a fault, and the rate of false alarms.
+        on_fault: called with every report in the estimator's thread.
 
     Attributes:
-        faults: what was found, each once: the settled report takes the place of the first.
+        faults: reports, one for each fault: the settled report replaces the first one.
     """
 
     def __init__(self, vehicle: Vehicle, rules: FaultRules, *, on_fault: Callable[[Fault], None] | None = None) -> None:
@@ -60,11 +60,11 @@ class FlightMonitor:
         per_hour = rules.false_alarms_per_hour
         self._detector = Detector(vehicle, false_alarms_per_hour=(1.0 - SHARE_OF_RUNS) * per_hour)
         self._runs = {name: RunTest(SHARE_OF_RUNS * per_hour / len(REPEATING)) for name in REPEATING}
-        self._broken = -math.inf  # s, when the model held last
+        self._broken = -math.inf  # s, last time at which the model did not hold
         self.faults: tuple[Fault, ...] = ()
 
     def watch(self, estimator: Any) -> bool:
-        """Look at what an estimator filters, or the one inside it; whether there is one that can be looked at."""
+        """Observe an estimator, or the one inside it; False if it cannot be observed."""
         while hasattr(estimator, "inner"):
             estimator = estimator.inner
         if not hasattr(estimator, "on_filtered"):
@@ -73,7 +73,7 @@ class FlightMonitor:
         return True
 
     def take(self, sample: Sample, *, airborne: bool) -> None:
-        """One sample, before the estimator has it."""
+        """One sample, before the estimator gets it."""
         test = self._runs.get(sample.signal)
         if test is not None and test.add(sample.time, sample.value) and airborne:
             self._report(
@@ -84,7 +84,7 @@ class FlightMonitor:
             )  # fmt: skip
 
     def stops(self, time: float) -> str:
-        """Why nothing is to be pushed at `time` [s], "" where the model holds."""
+        """Why nothing may be pushed at `time` [s], "" if the model holds."""
         if self.rules.action == "report":
             return ""
         followed = bool(self.faults) and self.faults[-1].followed
@@ -95,7 +95,7 @@ class FlightMonitor:
         return ""
 
     def wants_landing(self, fault: Fault) -> bool:
-        """Whether the policy says that the drone lands because of this."""
+        """Whether the drone must land because of this fault, by the policy."""
         return self.rules.action == "land" and not fault.followed
 
     @property

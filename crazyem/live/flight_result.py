@@ -1,4 +1,4 @@
-"""What came out of a flight, a watch or a replay: the estimate, the summary, and how both came about."""
+"""The result of a flight, a watch or a replay: the estimate, the summary, and their history."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ class FlightResult:
 
     Attributes:
         estimate: the final one, of the newest window.
-        summary: for programs; its keys are those of the command's JSON (docs/reference/json.md).
+        summary: for programs, with the keys of the command's JSON (docs/reference/json.md).
         history: track, estimates, writes and steps of mass over time.
         vehicle: the nominal one.
-        title: what was flown, in one line.
+        title: of the flight, one line.
     """
 
     estimate: Estimate
@@ -49,7 +49,7 @@ class FlightResult:
         return html_table(self.title, header, rows, self.summary["notices"])
 
     def plot(self, path: str | Path | None = None) -> "Figure":
-        """Estimates with intervals over time, writes and height; saved where `path` says.
+        """Plot of estimates with intervals over time, writes and height; saved to `path` if given.
 
         Raises:
             UsageError: the file cannot be written. MissingExtraError: no matplotlib.
@@ -74,12 +74,12 @@ def result_of(
 
     Args:
         log: path of the recording.
-        received, lost: log packets, of a foreign recording samples.
+        received, lost: numbers of log packets; for a foreign recording, of samples.
         extra: further keys of the summary.
         notices: further sentences for the user.
 
     Raises:
-        DataError: nothing was flown that could be estimated from.
+        DataError: there is no flight to estimate from.
     """
     history = pipeline.history
     for sentence in notices:

@@ -1,7 +1,7 @@
-"""Streams a session to Foxglove while it runs: the topics and messages of a recording, over a WebSocket on this host.
+"""Streams a running session to Foxglove: topics and messages of a recording, over a WebSocket on this host.
 
-The messages are made by the recorder's own code (`RecordingWriter`), so that the layout of `crazyem layout` shows a
-flight and its recording alike. The server is foxglove-sdk's, with threads of its own; a slow viewer loses messages.
+The recorder's own code (`RecordingWriter`) makes the messages, so the layout of `crazyem layout` works for a flight and
+for its recording. The server belongs to foxglove-sdk and has its own threads; a slow viewer loses messages.
 """
 
 import contextlib
@@ -15,13 +15,13 @@ from crazyem.extras import require
 from crazyem.live.recorder import Recorder
 from crazyem.recordings.mcap.writer import RecordingWriter
 
-FOXGLOVE_PORT = 8765  # what viewers propose
-FOXGLOVE_HOST = "127.0.0.1"  # anybody who reaches the port sees the flight
+FOXGLOVE_PORT = 8765  # default port of viewers
+FOXGLOVE_HOST = "127.0.0.1"  # this host only, because anybody who reaches the port sees the flight
 FRAME_SCHEMA = "foxglove.FrameTransform"
 
 
 def sdk() -> ModuleType:
-    """The module foxglove. Raises MissingExtraError where it is not installed."""
+    """The module foxglove. Raises MissingExtraError if it is not installed."""
     return require("foxglove", "--foxglove")
 
 
@@ -31,7 +31,7 @@ class FoxgloveServer:
     Args:
         port: 0 takes any free one.
 
-    Raises: UsageError: foxglove-sdk is missing, or the port is not to be had.
+    Raises: UsageError: foxglove-sdk is missing, or the port is not available.
     """
 
     def __init__(self, port: int = FOXGLOVE_PORT) -> None:
@@ -53,14 +53,14 @@ class FoxgloveServer:
 
     @property
     def url(self) -> str:
-        """Where a viewer connects to."""
+        """Address for viewers."""
         return f"ws://{FOXGLOVE_HOST}:{self.port}"
 
     def recorder(self, name: str = "") -> RecordingWriter:
-        """What a session streams through.
+        """The recorder through which a session streams.
 
         Args:
-            name: of the drone, put before its topics (/NAME/estimate, frame NAME); "" where there is only one.
+            name: of the drone, before its topics (/NAME/estimate, frame NAME); "" if there is only one drone.
         """
         return RecordingWriter("", output=Topics(self._context, name))
 
@@ -73,7 +73,7 @@ class FoxgloveServer:
 
 
 class Topics:
-    """Takes what a recording's `Output` takes and gives it to the server's channels."""
+    """An `Output` of a recording that sends all messages to the server's channels."""
 
     def __init__(self, context: Any, name: str) -> None:
         self._foxglove = sdk()
@@ -83,7 +83,7 @@ class Topics:
         self._frames: set[int] = set()
 
     def start(self, profile: str, library: str) -> None:
-        """Nothing to say."""
+        """Does nothing."""
 
     def schema(self, name: str, encoding: str, data: bytes) -> int:
         """Number of a schema."""
@@ -93,7 +93,7 @@ class Topics:
     def channel(self, topic: str, encoding: str, schema: int, metadata: Mapping[str, str] | None = None) -> int:
         """Number of a new topic."""
         kind = self._schemas[schema - 1]
-        prefix = f"/{self._name}" if self._name and kind.name != FRAME_SCHEMA else ""  # frames have names of their own
+        prefix = f"/{self._name}" if self._name and kind.name != FRAME_SCHEMA else ""  # frames: see `_renamed`
         self._channels.append(
             self._foxglove.Channel(
                 f"{prefix}{topic}", schema=kind, message_encoding=encoding, context=self._context,
@@ -111,7 +111,7 @@ class Topics:
         self._channels[channel - 1].log(data, log_time=log_time)
 
     def _renamed(self, data: bytes) -> bytes:
-        """A transform of this drone's frame instead of every drone's."""
+        """A transform with the name of this drone's frame."""
         from crazyem.recordings.mcap.schemas import message_class
 
         message = message_class(FRAME_SCHEMA).FromString(data)
@@ -122,21 +122,21 @@ class Topics:
         """Not for viewers."""
 
     def flush(self, *, sync: bool = False) -> None:
-        """Messages have left already."""
+        """Does nothing: messages are sent at once."""
 
     def finish(self) -> None:
         """See `close`."""
 
     def close(self) -> None:
-        """Take the topics away."""
+        """Close the topics."""
         for channel in self._channels:
             channel.close()
 
 
 class Both:
-    """Two recorders as one: a file, and a stream beside it. What is called is called of both.
+    """Two recorders as one: a file and a stream. Every call goes to both.
 
-    The file counts: its path, its failure, "" without one. A stream that fails ends alone.
+    Path and failure are those of the file, "" without one. A failed stream does not affect the file.
     """
 
     def __init__(self, file: Recorder | None, stream: Recorder) -> None:
@@ -154,7 +154,7 @@ class Both:
         return self._file.failure if self._file is not None else ""
 
     def frame(self, *arguments: Any) -> None:
-        """As `FrameRecorder`, which asks for it by name."""
+        """See `FrameRecorder`, whose check needs this method by name."""
         self._each("frame", *arguments)
 
     def __getattr__(self, method: str) -> Callable[..., None]:

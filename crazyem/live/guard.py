@@ -1,4 +1,4 @@
-"""The gate between estimate and controller: decides what may be written to a flying drone, and says why not."""
+"""The guard between estimate and controller: it decides what may be written to a flying drone, with reasons."""
 
 import math
 from collections import deque
@@ -10,37 +10,37 @@ from crazyem.estimation.result import Estimate, ParameterEstimate, Step
 from crazyem.live.beliefs import DRAG_NAMES, INERTIA_NAMES
 from crazyem.live.controllers import Controller, writes_for
 
-# After a change of mass its new value has to agree for this share of the agreement time, and may follow the last write
-# after this share of the interval: what is known is that the old value is wrong.
+# After a change of mass the old value is known to be wrong. So the new value has to agree for this share of the
+# agreement time only, and may follow the last write after this share of the interval.
 STEP_SHARE = 0.4
 WRITABLE_ESTIMATES = ("mass", *INERTIA_NAMES, "motor_time_constant", "mass_thrust", *DRAG_NAMES)
-# Which limits hold for an estimate, by the first part of their names.
+# Estimate -> prefix of the names of its limits.
 LIMITS_OF = {"mass": "mass", "motor_time_constant": "lag", "mass_thrust": "mass_thrust"}
 LIMITS_OF |= dict.fromkeys(INERTIA_NAMES, "inertia") | dict.fromkeys(DRAG_NAMES, "drag")
-# Largest 95 % half widths between a belief about INDI's loop gain and an acceptable estimate beyond which the belief
-# counts as wrong: the estimate then has to agree with itself for `STEP_SHARE` of the time, and waits as much shorter.
+# A belief about INDI's loop gain counts as wrong if its distance from an acceptable estimate is more than this many of
+# the largest allowed 95 % half widths. Then `STEP_SHARE` applies to the agreement time and the interval.
 REFUTED = 3.0
-LARGEST_STEP = 0.25  # relative change of mass that one write may follow at once
-STEP_RECENT = 5.0  # s for which that holds, or until the new mass is written
+LARGEST_STEP = 0.25  # largest relative step of mass that is added to the slew of one write
+STEP_RECENT = 5.0  # s after a step during which it is added, unless the new mass is written earlier
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What the guard asks of an estimate before it reaches a controller.
+    """Conditions of the guard on an estimate before it is written to a controller.
 
     Attributes:
-        parameters: which of `WRITABLE_ESTIMATES` may be written at all.
+        parameters: those of `WRITABLE_ESTIMATES` that may be written.
         ..._bounds: allowed range as multiples of the vehicle's nominal value.
-        ..._absolute: allowed range in SI units, whatever the vehicle file says.
+        ..._absolute: allowed range in SI units, for any vehicle file.
         ..._half_width: largest 95 % half width, relative to the value.
-        ..._agreement: largest spread (max - min over value) within `agreement_time`.
-        ..._deadband: relative changes smaller than this are not worth a write.
-        effectiveness_...: what stands for an incremental controller's inertia and lag instead of `slew`, `unjudged`,
-            `inertia_bounds` and `inertia_deadband`.
+        ..._agreement: largest spread, (max - min) over value, within `agreement_time`.
+        ..._deadband: relative changes smaller than this are not written.
+        effectiveness_...: replace `slew`, `unjudged`, `inertia_bounds` and `inertia_deadband` for an incremental
+            controller.
         drag_slew: largest change of drag over mass in one write, 1/s.
-        agreement_time: s over which estimates have to agree, all of them acceptable.
-        slew: largest relative change in one write; a step of mass adds itself, up to `LARGEST_STEP`.
-        unjudged: largest relative change from what was last judged good.
+        agreement_time: s during which all estimates have to be acceptable and agree.
+        slew: largest relative change in one write; the size of a mass step is added, up to `LARGEST_STEP`.
+        unjudged: largest relative change from the belief that was last judged good.
         interval: s between writes.
     """
 
@@ -85,28 +85,29 @@ class Limits:
         return getattr(self, f"{LIMITS_OF[name]}_{kind}")
 
     def allowed(self, name: str, nominal: float) -> tuple[float, float]:
-        """Allowed range [SI] of an estimate whose nominal value is `nominal`: both kinds of bounds hold.
+        """Allowed range [SI] of an estimate with the nominal value `nominal`: both kinds of bounds hold.
 
-        Where nothing is nominal (a vehicle without lag, drag) the absolute ones alone.
+        Without a nominal value (a vehicle without lag, drag) only the absolute bounds hold.
         """
         least, most = self.of(name, "absolute")
         low, high = (b * nominal for b in self.of(name, "bounds")) if nominal > 0.0 else (least, most)
         return max(low, least), min(high, most)
 
     def for_incremental(self) -> "Limits":
-        """The limits for a controller that believes control effectiveness."""
+        """The limits for a controller that uses control effectiveness."""
         return replace(self, inertia_bounds=self.effectiveness_bounds, inertia_deadband=self.effectiveness_deadband)
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What to write (name, value) in order, or nothing and why.
+    """Ordered writes (name, value), or none and the reasons.
 
     Attributes:
-        time: s on the drone's clock of the estimate it rests on.
+        time: s on the drone's clock, of the estimate behind the decision.
         writes: firmware parameters and values, in the order to be written.
-        reason: per estimated parameter, why it is not written; empty where it is. Of a revert: why.
-        kind: "push"; "revert" to the last good values in flight; "restore" after it. Only pushes end with the guard.
+        reason: for each estimate, why it is not written; empty if it is. For a revert, the reason of the revert.
+        kind: "push"; "revert" to the last good values in flight; "restore" after the flight. A stopped guard ends
+            pushes only.
     """
 
     time: float
@@ -128,10 +129,10 @@ class Decision:
 
 
 class Guard:
-    """Decides, estimate by estimate. No clock, no input or output: the same estimates give the same decisions.
+    """Decides after each estimate. It uses no clock, input or output: the same estimates give the same decisions.
 
     Args:
-        controller: where the values go.
+        controller: that gets the values.
         nominal: mass [kg], Ixx, Iyy, Izz [kg m^2], ... of the vehicle file, the centre of the allowed range.
         originals: the controller's parameter values at connect.
         limits: see `Limits`.
@@ -157,30 +158,30 @@ class Guard:
         self._last_write = float("-inf")
         self._before: tuple[dict[str, float], float] | None = None
         self._step: Step | None = None
-        self.capped = True  # whether changes wait for a verdict; not where nobody judges
-        self._trusted = dict(self.beliefs)  # what the controller believed when it was last judged
+        self.capped = True  # whether `unjudged` limits changes; False if writes are not judged
+        self._trusted = dict(self.beliefs)  # beliefs of the controller that were last judged good
 
     def _beliefs(self) -> dict[str, float]:
         return {belief.name: belief.read(self.originals) for belief in self.controller.beliefs}
 
     def withdraw(self) -> None:
-        """The newest decision was not carried out: the controller still believes what it did before."""
+        """The newest decision was not carried out: the controller keeps its old beliefs."""
         if self._before is not None:
             self.beliefs, self._last_write = dict(self._before[0]), self._before[1]
             self._before = None
 
     def trust(self) -> None:
-        """What the controller believes now was judged good."""
+        """The present beliefs of the controller were judged good."""
         self._trusted = dict(self.beliefs)
 
     def stop(self, reason: str) -> None:
-        """Never write again in this flight (a write was not confirmed: what the drone believes is not known)."""
+        """Never write again in this flight, for example after an unconfirmed write, when the beliefs are unknown."""
         self.stopped = self.stopped or reason
 
     def on_mass_step(self, step: Step, time: float = math.nan) -> None:
-        """A change of mass was noticed, or it is known by now what it was: what was estimated before is of no use.
+        """A change of mass was detected, or its cause is now known; estimates from before are dropped.
 
-        `time` [s] is part of what a pipeline calls; a guard alone needs only the step's own times.
+        `time` [s] belongs to the interface of the pipeline; the guard needs only the times of the step.
         """
         if step.jumped:
             self.stop(f"{step}; nothing more is pushed.")
@@ -191,14 +192,14 @@ class Guard:
     def consider(
         self, estimate: Estimate, time: float, *, airborne: bool, enabled: bool = True, objection: str = ""
     ) -> Decision:
-        """What to write after this estimate.
+        """The decision after an estimate.
 
         Args:
             estimate: the newest.
             time: s on the drone's clock.
-            airborne: False on the ground or in contact; history is forgotten then.
-            enabled: False while the flight is not in a phase where writes are wanted; history is kept.
-            objection: why nothing may be written now whatever the estimate (battery, supervisor); history is kept.
+            airborne: False on the ground or in contact; this clears the history.
+            enabled: False in phases of the flight without writes; the history is kept.
+            objection: why nothing may be written now (battery, supervisor); the history is kept.
         """
         if self.stopped:
             return Decision(time, reason=self.stopped)
@@ -231,7 +232,7 @@ class Guard:
                 low, high = self.limits.allowed(name, self.nominal.get(name, 0.0))
                 if low <= value <= high:
                     changed[name] = value
-                else:  # one step from what it believes now still leads outside
+                else:  # one write from the present belief still ends outside
                     reasons[name] = f"the controller believes {self.beliefs[name]:.4g}, too far outside to lead it back"
         changed = self._together(changed, reasons)
         if not changed:
@@ -245,10 +246,10 @@ class Guard:
         return Decision(time, writes=writes, reason=reasons)
 
     def _together(self, changed: Mapping[str, float], reasons: dict[str, str]) -> dict[str, float]:
-        """Without what waits for others (`Controller.waits`), which gets a reason."""
+        """The changes without those that wait for other estimates (`Controller.waits`); these get a reason."""
         for name, others in self.controller.waits.items():
             late = [o for o in others if o not in changed and reasons.get(o) != "unchanged"]
-            if not self.controller.attitude_gains:  # a g1 for each axis: what is refuted, or alone in a policy, goes
+            if not self.controller.attitude_gains:  # one g1 per axis: a refuted or sole one does not wait
                 late = [] if self._refuted(name) else [o for o in late if o in self.limits.parameters]
             if name in changed and late:
                 reasons[name] = f"waits for {late[0]}"
@@ -258,14 +259,14 @@ class Guard:
         values = {n: self._found(estimate, n).value for n in self.beliefs}
         faults = {n: self._fault(estimate, n) for n in self.beliefs}
         self._history.append((time, values, faults))
-        # One entry older than the span stays, so that the span is really covered.
+        # Keep one entry older than the span, so that the span is covered.
         while len(self._history) > 2 and self._history[1][0] <= time - self.limits.agreement_time:
             self._history.popleft()
 
     def _found(self, estimate: Estimate, name: str) -> ParameterEstimate:
-        """What is known of an estimate: by the flight, or by the vehicle file once the flight has shown the mass.
+        """An estimate from the flight, or a known value from the vehicle file once the mass is known well enough.
 
-        The mass need not have settled to its last digit: that it is seen shows that thrust is what the file says.
+        A known mass shows that the thrust agrees with the vehicle file.
         """
         p = estimate.parameters.get(name)
         if p is not None:
@@ -293,7 +294,7 @@ class Guard:
         return ""
 
     def _recent_step(self, time: float) -> Step | None:
-        """The change of mass that the controller does not know yet."""
+        """The recent change of mass that is not written yet."""
         step = self._step
         return step if step is not None and step.real and time - step.found < STEP_RECENT else None
 
@@ -307,7 +308,7 @@ class Guard:
             return newest[2][name]
         if time - self._history[0][0] < needed:
             return "too early to tell"
-        # one older than the span is looked at, so that the span is really covered
+        # begin with one entry older than the span, so that the span is covered
         first = max((k for k, (t, _, _) in enumerate(self._history) if t <= time - needed), default=0)
         span = list(self._history)[first:]
         if any(faults[name] for _, _, faults in span):
@@ -321,7 +322,7 @@ class Guard:
         return ""
 
     def _refuted(self, name: str) -> bool:
-        """Whether what INDI believes of its loop gain is so far from an acceptable estimate that it counts as wrong."""
+        """Whether a belief about INDI's loop gain is so far from an acceptable estimate that it counts as wrong."""
         _, values, faults = self._history[-1]
         if not self.controller.incremental or name not in INERTIA_NAMES or faults[name] or not self.beliefs[name] > 0:
             return False
@@ -336,7 +337,7 @@ class Guard:
         if name == "mass" and step is not None and step.after is not None:
             slew += min(abs(step.after / step.before - 1), LARGEST_STEP)
         if not now > 0:
-            return value  # the controller believed nonsense; the bounds around nominal still hold
+            return value  # the belief is invalid; the bounds around the nominal value still hold
         low, high = now * (1 - slew), now * (1 + slew)
         trusted = self._trusted[name]
         if self.capped and trusted > 0:

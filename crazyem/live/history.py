@@ -1,4 +1,4 @@
-"""What a session remembers for its summary and plot: the track, the estimates, the pushes and the phases."""
+"""Data that a session keeps for its summary and plot: track, estimates, pushes and phases."""
 
 import math
 from array import array
@@ -11,16 +11,16 @@ from crazyem.estimation.result import Estimate, Step
 from crazyem.monitoring.fault import Fault
 from crazyem.signals.sample import Sample
 
-MOST_ESTIMATES = 6000  # estimates; four minutes at 25 a second. The recording has them all
-TRACK_ROWS = 60_000  # of a track; ten minutes at 100 Hz
-SETTLE_SECONDS = 4.0  # s after the first push before a tracking error counts as "after": the height loop takes 2 to 3 s
+MOST_ESTIMATES = 6000  # most estimates: four minutes at 25 a second. The recording has all of them
+TRACK_ROWS = 60_000  # most rows of a track: ten minutes at 100 Hz
+SETTLE_SECONDS = 4.0  # s from the first push until a tracking error counts as "after": the height loop takes 2 to 3 s
 
 
 @dataclass(frozen=True)
 class Push:
-    """One parameter write: time on the drone's clock [s], what was written and whether its echo came back equal.
+    """One parameter write: time on the drone's clock [s], parameter, value, and whether the echo was equal.
 
-    `purpose` is "push", or why it was taken back: "revert" in flight, "restore" after it, "undo" of half a set.
+    `purpose` is "push", or for old values "revert" in flight, "restore" after the flight, "undo" of an incomplete set.
     """
 
     time: float
@@ -30,20 +30,20 @@ class Push:
     purpose: str = "push"
 
     def to_json(self) -> dict[str, Any]:
-        """The form of the summary; the purpose only where it is not the usual one."""
+        """The form of the summary, with the purpose unless it is "push"."""
         usual = {"time": self.time, "parameter": self.parameter, "value": self.value, "verified": self.verified}
         return usual if self.purpose == "push" else {**usual, "purpose": self.purpose}
 
 
 class Track:
-    """Rows of time [s] and xyz [m], evenly thinned so that memory is bounded: once full, every second one goes."""
+    """Rows of time [s] and xyz [m] with bounded memory: whenever full, every second row is dropped."""
 
     def __init__(self, rows: int = TRACK_ROWS) -> None:
         self._values, self._most = array("d"), 4 * rows
         self._every, self._seen = 1, 0
 
     def add(self, time: float, position: tuple[float, ...]) -> None:
-        """A row, unless it is one that would be thinned out."""
+        """Add a row, unless the present thinning drops it."""
         if self._seen % self._every == 0:
             self._values.extend((time, *position))
             if len(self._values) == self._most:
@@ -58,18 +58,18 @@ class Track:
 
 @dataclass
 class History:
-    """What a session keeps; its memory is bounded but for the pushes, of which there are two a second at most.
+    """Data of a session; its memory is bounded except for pushes, at most two a second.
 
     Attributes:
         track: position in the world.
-        setpoints: active setpoint, likewise.
-        estimates: in order; of old ones, where they are more than `MOST_ESTIMATES`, every second (again and again).
+        setpoints: active setpoint in the world.
+        estimates: in order; whenever there are more than `MOST_ESTIMATES`, every second of the older half is dropped.
         pushes: every parameter write by the guard.
         marks: phase -> time on the drone's clock [s]: trajectory_start, trajectory_end, push_enabled.
         notices: sentences for the user.
-        steps: changes of mass that were noticed, the newest perhaps undecided.
-        faults: what the monitor found.
-        guard: what the guard was told and did, empty where there was none (`WriteSupervisor.account`).
+        steps: detected changes of mass; the cause of the newest may be undecided.
+        faults: reports of the monitor.
+        guard: mode, policy and decisions of the guard, empty without one (see `WriteSupervisor`).
     """
 
     track: Track = field(default_factory=Track)
@@ -96,16 +96,16 @@ class History:
             self.track.add(sample.time, sample.value)
 
     def keep(self, estimate: Estimate) -> None:
-        """Add an estimate. Whoever reads the list meanwhile keeps the one it has: a thinned list is another one."""
+        """Add an estimate. Thinning makes a new list, so other threads can still read the old one."""
         self.estimates.append(estimate)
         if len(self.estimates) > MOST_ESTIMATES:
             half = MOST_ESTIMATES // 2
             self.estimates = self.estimates[:half:2] + self.estimates[half:]
 
     def track_array(self) -> np.ndarray:
-        """Time, position and setpoint, shape (n, 7); the setpoint is interpolated onto the positions' times.
+        """Time, position and setpoint, shape (n, 7).
 
-        The two travel in packets of different instants; NaN where no setpoint is known.
+        The setpoint is interpolated to the times of the positions, which come in other packets; NaN if unknown.
         """
         track = self.track.array()
         out = np.full((len(track), 7), np.nan)
@@ -119,7 +119,7 @@ class History:
     def _error(self) -> tuple[np.ndarray, np.ndarray]:
         """Time and position error (position - setpoint), shape (n,) and (n, 3), during the trajectory."""
         track = self.track_array()
-        # Without marks (somebody else's flight) nobody knows when the setpoint was meant to be followed.
+        # Without marks (the flight of another program) it is unknown when the drone should follow the setpoint.
         start, end = self.marks.get("trajectory_start", math.inf), self.marks.get("trajectory_end", math.inf)
         keep = (track[:, 0] >= start) & (track[:, 0] <= end) & np.isfinite(track[:, 4:]).all(axis=1)
         return track[keep, 0], track[keep, 1:4] - track[keep, 4:7]

@@ -1,9 +1,8 @@
-"""Hover thrust of PX4 and ArduPilot as something the guard can write: a mass in other units.
+"""Hover thrust of PX4 and ArduPilot as a parameter for the guard: a mass in other units.
 
-A drone whose hover thrust parameter was right at the mass of the vehicle file needs, at another mass, the old value
-times the ratio of the masses, as long as thrust grows in proportion to what is asked for. That holds where the
-autopilot linearises its motors (THR_MDL_FAC, MOT_THST_EXPO) and the battery (MOT_BAT_VOLT_MAX); else it is a first
-step.
+The hover thrust parameter is assumed to be right at the mass of the vehicle file. At another mass it is scaled by the
+ratio of the masses, if thrust is proportional to the command. This holds if the autopilot linearises its motors
+(THR_MDL_FAC, MOT_THST_EXPO) and the battery (MOT_BAT_VOLT_MAX); otherwise the new value is an approximation.
 """
 
 import math
@@ -21,10 +20,10 @@ _NO_CONTROLLER = -1  # there is no stabilizer.controller
 
 
 def hover_target(link: HoverThrustLink, vehicle: Vehicle) -> tuple[Controller | None, str]:
-    """Where estimates can be pushed to on a MAVLink drone, or None and one sentence why not.
+    """The target of pushes on a MAVLink drone, or None and one sentence why there is none.
 
     Args:
-        link: open. vehicle: its mass is the one at which the parameter was right.
+        link: open. vehicle: the parameter is assumed to be right at its mass.
     """
     name = link.hover_parameter
     if not name:
@@ -44,7 +43,7 @@ def hover_target(link: HoverThrustLink, vehicle: Vehicle) -> tuple[Controller | 
 
 
 def hover_rules(rules: WriteRules, link: HoverThrustLink, controller: Controller | None) -> WriteRules:
-    """The policy's bounds and those of hover thrust, whichever are narrower; its battery threshold for every cell."""
+    """Rules with the narrower of the policy's bounds and those of hover thrust; the battery threshold is per cell."""
     policy = rules.policy
     if controller is not None:
         least, most = policy.limits.mass_absolute
@@ -60,12 +59,12 @@ def hover_rules(rules: WriteRules, link: HoverThrustLink, controller: Controller
 
 
 def hover_afterwards(controller: Controller, *, now: Mapping[str, float], before: Mapping[str, float]) -> str:
-    """What has to be known before the next session, one sentence; "" if the drone holds what it held.
+    """One sentence for the user before the next session; "" if the parameter has its value from connect.
 
-    The next session would take the new value for right at the old mass, and make the same correction twice.
+    The next session would assume that the new value is right at the old mass, and make the same correction again.
 
     Args:
-        now: parameters the drone holds, NaN where not known. before: at connect.
+        now: parameter values in the drone, NaN if unknown. before: at connect.
     """
     name = controller.mass
     value = now.get(name, math.nan)

@@ -1,4 +1,4 @@
-"""Single keys from a terminal, read without blocking; the terminal is put back whatever happens."""
+"""Single keys from a terminal, read without blocking; the terminal is always restored."""
 
 import atexit
 import contextlib
@@ -23,12 +23,12 @@ def is_terminal(fd: int) -> bool:
 
 
 class Keys:
-    """Keys as they are pressed, within a `with` block. Ctrl-C stays what it is: a signal.
+    """Single keys within a `with` block. Ctrl-C still raises its signal.
 
-    Outside the block, after an exception and at the end of the process the terminal is as it was before.
+    The terminal is restored after the block, after an exception and at the end of the process.
 
     Args:
-        fd: of the terminal; None takes standard input.
+        fd: of the terminal; None: standard input.
     """
 
     def __init__(self, fd: int | None = None) -> None:
@@ -36,7 +36,7 @@ class Keys:
         self._fd = -1
         self._before: list[Any] | None = None
         self._open = False
-        self._waiting = ""  # pressed so fast that they came together
+        self._waiting = ""  # further keys of one read
 
     def __enter__(self) -> "Keys":
         self.begin()
@@ -47,11 +47,11 @@ class Keys:
 
     @property
     def reading(self) -> bool:
-        """Whether keys can come: false where there is no terminal, or it has gone away."""
+        """Whether keys can be read: False without a terminal, or once it is closed."""
         return self._open
 
     def begin(self) -> None:
-        """Take keys one by one and do not echo them; does nothing where there is no terminal."""
+        """Read single keys without echo from now on; does nothing without a terminal."""
         try:
             fd = sys.stdin.fileno() if self._given is None else self._given
             if termios is None or not is_terminal(fd):
@@ -63,24 +63,24 @@ class Keys:
             self._fd, self._before = fd, before
             atexit.register(self.end)
             termios.tcsetattr(fd, termios.TCSADRAIN, now)
-        except (OSError, ValueError, AttributeError):  # standard input may be closed, or no file at all
+        except (OSError, ValueError, AttributeError):  # standard input may be closed, or not a file
             self.end()
             return
         self._open = True
 
     def end(self) -> None:
-        """Put the terminal back; safe to call at any time and twice."""
+        """Restore the terminal; safe to call at any time and twice."""
         before, self._before, self._open = self._before, None, False
         if before is None:
             return
         atexit.unregister(self.end)
-        with contextlib.suppress(Exception):  # a terminal that was closed needs nothing; termios.error is no OSError
+        with contextlib.suppress(Exception):  # a closed terminal needs nothing; termios.error is not an OSError
             termios.tcsetattr(self._fd, termios.TCSADRAIN, before)
 
     def read(self, timeout: float) -> str:
-        """The next key, "" if none is pressed within `timeout` [s]. Arrow and function keys are swallowed whole.
+        """The next key, "" if none is pressed within `timeout` [s]. Arrow and function keys are ignored.
 
-        Where `reading` is false it returns "" at once.
+        Returns "" at once if `reading` is False.
         """
         if not self._open:
             return ""

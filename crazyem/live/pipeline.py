@@ -1,7 +1,7 @@
-"""The one path of a sample: decode, estimate, gate, push. Flying, watching, replaying and attaching all run it.
+"""The path of a sample through estimator, guard and push, common to flying, watching, replaying and attaching.
 
-Nothing here reads a clock or a random number, and nothing that is pushed comes back in, so the same packets in the
-same order give the same estimates, live or replayed.
+The code reads no clock and no random number, and pushes do not affect the estimator. So the same packets in the same
+order give the same estimates, live or in a replay.
 """
 
 import math
@@ -16,7 +16,7 @@ from crazyem.signals.sample import Sample
 
 
 class Estimator(Protocol):
-    """What the pipeline needs of an estimator: an OnlineEstimator, or one around it that finds steps of mass."""
+    """Interface of an estimator: an OnlineEstimator, or one around it that detects steps of mass."""
 
     @property
     def airborne(self) -> bool: ...
@@ -28,7 +28,7 @@ class Estimator(Protocol):
 
 
 class Gate(Protocol):
-    """What decides over writes: a `Guard`, or a `WriteSupervisor` around it."""
+    """Interface of the object that decides about writes: a `Guard`, or a `WriteSupervisor` around it."""
 
     def consider(self, estimate: Estimate, time: float, *, airborne: bool, enabled: bool = True) -> Decision: ...
     def on_mass_step(self, step: Step, time: float) -> None: ...
@@ -36,7 +36,7 @@ class Gate(Protocol):
 
 @runtime_checkable
 class StepFinder(Protocol):
-    """An estimator that looks for steps of mass."""
+    """An estimator that detects steps of mass."""
 
     @property
     def steps(self) -> Sequence[Step]: ...
@@ -52,34 +52,34 @@ class EstimatorAround(Protocol):
 
 @runtime_checkable
 class ResidualSource(Protocol):
-    """An estimator that knows the innovations of its newest sample: time [s], values, standard deviations."""
+    """An estimator that gives the innovations of its newest sample: time [s], values, standard deviations."""
 
     @property
     def residual(self) -> tuple[float, Any, Any] | None: ...
 
 
 def steps_of(estimator: object) -> Sequence[Step]:
-    """The steps that an estimator, or the one inside it, has found; none where it does not look for any."""
+    """The steps of mass that an estimator, or the one inside it, has detected; empty if it detects none."""
     if isinstance(estimator, StepFinder):
         return tuple(estimator.steps)
     return steps_of(estimator.inner) if isinstance(estimator, EstimatorAround) else ()
 
 
 def residual_of(estimator: object) -> tuple[float, Any, Any] | None:
-    """Innovations of the newest sample, None where the estimator does not say them."""
+    """Innovations of the newest sample, None if the estimator does not give them."""
     return estimator.residual if isinstance(estimator, ResidualSource) else None
 
 
 class Pipeline:
-    """Feeds samples to the estimator, its estimates to the guard, and the guard's writes to whoever writes.
+    """Feeds samples to the estimator, its estimates to the guard, and the guard's decisions to `push`.
 
     Args:
         estimator: see `Estimator`.
         history: keeps track, estimates and pushes for the summary.
-        guard: None where nothing is to be pushed.
+        guard: None: nothing is pushed.
         push: takes a decision with writes; must not block.
         on_estimate: called with every estimate (live line, recording).
-        on_step: called with every step of mass when it is noticed, and again when it is decided what it was.
+        on_step: called with every step of mass when it is detected, and again when its cause is known.
         monitor: of faults in flight, or None.
     """
 
@@ -101,15 +101,15 @@ class Pipeline:
         self.on_estimate = on_estimate
         self.on_step = on_step
         self.monitor = monitor if monitor is not None and monitor.watch(estimator) else None
-        self.push_from = math.inf  # s on the drone's clock; estimates of this time and later may be pushed
+        self.push_from = math.inf  # s on the drone's clock; estimates from this time on may be pushed
         self.push_until = math.inf
-        self.paused = False  # by a person: nothing new is pushed meanwhile
-        self.estimate_until = math.inf  # s; later samples (the landing) belong to the track, not to the estimate
+        self.paused = False  # by the user: nothing new is pushed
+        self.estimate_until = math.inf  # s; later samples (the landing) do not go to the estimator
         self.decision: Decision | None = None
         self.samples = 0
 
     def sample(self, sample: Sample) -> Estimate | None:
-        """One sample further; the estimate if one is due."""
+        """Process one sample; returns an estimate if one is due."""
         self.samples += 1
         self.history.take(sample)
         if self.monitor is not None and sample.time <= self.estimate_until:
@@ -135,11 +135,11 @@ class Pipeline:
         return estimate
 
     def fault_objection(self, time: float) -> str:
-        """Why the monitor lets nothing be pushed at `time` [s], "" where it does, or there is none."""
+        """Why the monitor forbids pushes at `time` [s]; "" if it allows them, or without a monitor."""
         return "" if self.monitor is None else self.monitor.stops(time)
 
     def _take_steps(self, time: float) -> None:
-        """Tell of what is new about steps of mass before anything is decided on the estimate."""
+        """Report new or changed steps of mass; this comes before the decision about the estimate."""
         steps, known = steps_of(self.estimator), self.history.steps
         if not steps or (len(steps) == len(known) and steps[-1] is known[-1]):
             return
@@ -153,7 +153,7 @@ class Pipeline:
                 self.on_step(step)
 
     def finish(self) -> Estimate:
-        """The final estimate of the newest window, converged."""
+        """The final, converged estimate of the newest window."""
         estimate = self.estimator.finish()
         self.history.keep(estimate)
         self._take_steps(estimate.time)

@@ -54,7 +54,7 @@ def _draw_parameters(
     time: np.ndarray,
     nominal: Mapping[str, float],
 ) -> None:
-    """Values with intervals over `time` [s], (n,); dotted what the vehicle file says. The last ones set the limits."""
+    """Values with intervals over `time` [s], (n,); the vehicle file's values dotted. The last values set the limits."""
     limits = []
     for i, name in enumerate(names):
         if not all(name in e.parameters for e in estimates) or not estimates:

@@ -1,6 +1,6 @@
-"""The policy of the guard: what may be written to a flying drone, when it is taken back; TOML <-> dataclasses.
+"""The policy of the guard: rules for writes to a flying drone and for reverts; TOML <-> dataclasses.
 
-`crazyem/policies/default.toml` is the shipped one and explains every key.
+`crazyem/policies/default.toml` is the shipped policy and explains every key.
 """
 
 import math
@@ -15,17 +15,18 @@ from crazyem.live.guard import WRITABLE_ESTIMATES, Limits
 from crazyem.toml_file import is_number, parse_toml, read_text, toml_value
 
 LARGEST_POLICY_FILE = 65536  # bytes
-FAULT_ACTIONS = ("report", "stop", "land")  # tell; push nothing meanwhile; land as well, where crazyem flies
+FAULT_ACTIONS = ("report", "stop", "land")  # report only; stop pushes, too; land as well, if crazyem flies the drone
 END_RULES = ("keep", "good", "restore")
 
 
 @dataclass(frozen=True)
 class HealthLimits:
-    """What the drone must be like for a write.
+    """Conditions on the state of the drone for a write.
 
     Attributes:
-        supervisor: whether the firmware must say that it flies and that nothing is wrong.
-        battery: V, mean of the last second. tilt: rad. stale: s, age of the newest estimate on the drone's clock.
+        supervisor: whether the firmware's supervisor must report a flight without a fault.
+        battery: V, least mean voltage of the last second. tilt: rad, largest tilt.
+        stale: s, largest age of the newest estimate on the drone's clock.
     """
 
     supervisor: bool = True
@@ -36,23 +37,24 @@ class HealthLimits:
 
 @dataclass(frozen=True)
 class MonitorLimits:
-    """What counts as worse after a write than before.
+    """Limits for the comparison of the flight after a write with the flight before it.
 
     Attributes:
-        lead: s by which a setpoint may be ahead of a drone without that being an error. place_lead: s of the drone's
-            own speed by which a controller has to be given places ahead (INDI).
-        high_pass: s, time constant of the high-pass on body rates: 1.6 Hz, above what trajectories ask for.
+        lead: s by which the setpoint may be ahead of the drone; this lead is no error.
+        place_lead: s; the setpoints of INDI are ahead of the drone by this time multiplied by its velocity.
+        high_pass: s, time constant of the high-pass on body rates: 1.6 Hz, above the frequencies of trajectories.
         before, settle, after: s, lengths of the stretches.
-        unjudged: sets of writes that may follow each other before they were judged.
-        tracking_ratio, tracking, tracking_alarm: position error, relative to before, and over it [m].
-        innovation_ratio, innovation: normalised innovation, relative to before, and at least (standard deviations).
-        oscillation_ratio, oscillation, oscillation_alarm: fast part of the body rates, relative, and over it [rad/s].
-        incremental_oscillation: the same as `oscillation` [rad/s] after writes of control effectiveness, a loop gain.
+        unjudged: largest number of sets of writes before a verdict.
+        tracking_ratio, tracking, tracking_alarm: position error, relative to before, and excess over before [m].
+        innovation_ratio, innovation: normalised innovation, relative to before, and least value (standard deviations).
+        oscillation_ratio, oscillation, oscillation_alarm: fast part of the body rates, relative to before, and excess
+            over before [rad/s].
+        incremental_oscillation: replaces `oscillation` [rad/s] after writes of control effectiveness, a loop gain.
         tilt_alarm: rad.
     """
 
     enabled: bool = True
-    lead: float = 0.1  # no key of a policy, like the next two: they belong to the controller
+    lead: float = 0.1  # not a key of a policy, like the next two: they belong to the controller
     place_lead: float = 0.0
     high_pass: float = 0.1
     before: float = 2.0
@@ -73,7 +75,7 @@ class MonitorLimits:
 
 @dataclass(frozen=True)
 class EndRules:
-    """What is left in the drone after a flight that landed, was interrupted, failed, lost its link: of `END_RULES`."""
+    """Values left in the drone after a flight, one of `END_RULES` for each outcome of the flight."""
 
     landed: str = "keep"
     interrupted: str = "keep"
@@ -86,9 +88,8 @@ class FaultRules:
     """The monitor of faults in flight.
 
     Attributes:
-        enabled: whether it runs. false_alarms_per_hour: of flight, of all its tests together.
-        action: what follows a fault, one of `FAULT_ACTIONS`. resume: s after which pushing goes on once the model holds
-            again.
+        enabled: whether the monitor runs. false_alarms_per_hour: of flight, of all its tests together.
+        action: after a fault, one of `FAULT_ACTIONS`. resume: s for which the model must hold before pushes go on.
     """
 
     enabled: bool = False
@@ -99,11 +100,11 @@ class FaultRules:
 
 @dataclass(frozen=True)
 class Policy:
-    """The rules of the guard: what may be written to a flying drone, when, and what is taken back.
+    """The rules of the guard for writes to a flying drone and for reverts.
 
     Attributes:
-        limits: what an estimate must be like. health: what the drone must be like.
-        watch: what counts as worse after a write. end: what stays in the drone after the flight.
+        limits: conditions on estimates. health: conditions on the drone's state.
+        watch: comparison of the flight before and after a write. end: values left in the drone after the flight.
         monitor: of faults in flight.
     """
 
@@ -126,7 +127,7 @@ class Policy:
         return {"name": self.name, **self.entries()}
 
     def to_toml(self, *, against: "Policy | None" = None) -> str:
-        """The text of a policy file; reading it back gives an equal policy. Differences to `against` are remarked."""
+        """The text of a policy file, which reads back as an equal policy; comments show differences to `against`."""
         lines = [f"name = {toml_value(self.name)}"]
         others = against.entries() if against else {}
         for section, values in self.entries().items():
@@ -140,7 +141,7 @@ class Policy:
 
 @dataclass(frozen=True)
 class _Kind:
-    """How a key is checked and what it is in SI: `read` gives the value or raises ValueError with what it must be."""
+    """Check and unit of a key: `read` gives the value in SI, or raises ValueError with the requirement."""
 
     read: Callable[[Any], Any]
     shown: Callable[[Any], Any] = lambda value: value
@@ -275,7 +276,7 @@ def load_policy(path: str | Path | None = None) -> Policy:
     """The policy of a file, or the shipped one.
 
     Raises:
-        UsageError: no such file. FileFormatError: it is not a policy; the message names the key.
+        UsageError: no such file. FileFormatError: the file is not a policy; the message names the key.
     """
     if path is None:
         return parse_policy(default_text(), where="the default policy")

@@ -1,7 +1,7 @@
-"""Before against after: whether the drone flies worse since parameters were written, judged by three figures.
+"""Judges whether the drone flies worse after a write of parameters than before, by three figures.
 
-How far it is from its setpoint, how surprising its motion is to the estimator's model, and how much it trembles. All
-time is the drone's; the same samples and writes give the same verdicts.
+The figures are the distance from the setpoint, the normalised innovation of the estimator, and the oscillation of the
+body rates. All times are on the drone's clock; the same samples and writes give the same verdicts.
 """
 
 import math
@@ -12,19 +12,19 @@ from dataclasses import dataclass, replace
 from crazyem.live.policy import MonitorLimits
 from crazyem.signals.sample import Sample
 
-ALARM_SECONDS = 0.3  # s over which an alarm is taken
-# m/s by which the setpoint may speed up before innovations are not compared any more: drag, which the model does not
-# know, grows with speed.
+ALARM_SECONDS = 0.3  # s, averaging time of an alarm
+# m/s, largest increase of the setpoint's speed for a comparison of innovations: drag is not in the model and grows with
+# speed.
 LIKE_SPEED = 0.5
-SPEED_SPAN = 0.1  # s over which the setpoint's speed is taken: logged positions come in whole millimetres
-FEWEST_VALUES = 20  # values without which a stretch says nothing
-SERIES_LENGTH = 4096  # values of each series: bounded memory, whatever the rates
-LOST_TRACKING_DISTANCE = 1.0  # m; a drone that far from its setpoint before any write is not following it
-# s that a drone may take to its setpoint after its mass has changed, and after the new mass was written
+SPEED_SPAN = 0.1  # s, span for the setpoint's speed: logged positions are in whole millimetres
+FEWEST_VALUES = 20  # fewest values of a stretch
+SERIES_LENGTH = 4096  # values of each series: bounds the memory
+LOST_TRACKING_DISTANCE = 1.0  # m; a drone this far from its setpoint before a write does not follow it
+# s for the return to the setpoint after a change of mass, and after the write of the new mass
 RETURN_SECONDS = 2.5
-GUST_RETURN_SECONDS = 1.0  # s, the same after a gust that looked like one
-EXCUSED_ALARM = 0.5  # m by which it may be further away than the alarm meanwhile
-HIGH_PASS_GAP = 0.5  # s without a sample after which the high-pass begins anew
+GUST_RETURN_SECONDS = 1.0  # s, the same after a gust that looked like a change of mass
+EXCUSED_ALARM = 0.5  # m, added to the alarm limit during this time
+HIGH_PASS_GAP = 0.5  # s without a sample after which the high-pass starts again
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Figures:
 
     Attributes:
         tracking: distance from the setpoint, m. speed: of the setpoint, m/s.
-        innovation: normalised, 1 where the model's noise is right. oscillation: fast part of the body rates, rad/s.
+        innovation: normalised, 1 if the model's noise is right. oscillation: fast part of the body rates, rad/s.
     """
 
     tracking: float = math.nan
@@ -53,11 +53,11 @@ class _Series:
             self._items.append((time, square))
 
     def forget(self, since: float) -> None:
-        """What was added of a time after `since` [s]."""
+        """Drop values after `since` [s]."""
         self._items = deque((i for i in self._items if i[0] <= since), maxlen=SERIES_LENGTH)
 
     def rms(self, start: float, end: float, fewest: int = FEWEST_VALUES) -> float:
-        """Over [start, end], NaN with fewer than `fewest` values."""
+        """Root mean square over [start, end], NaN with fewer than `fewest` values."""
         total, count = 0.0, 0
         for time, square in reversed(tuple(self._items)):  # a copy: another thread adds to it
             if time < start:
@@ -69,10 +69,10 @@ class _Series:
 
 
 class PostWriteMonitor:
-    """Judges writes by what comes after them.
+    """Judges writes by the flight after them.
 
-    Several writes that follow each other closely are judged together, against the stretch before the first. Samples,
-    innovations and writes may come from three threads.
+    Several writes in short succession are judged together, against the stretch before the first. Samples, innovations
+    and writes may come from three threads.
     """
 
     def __init__(self, limits: MonitorLimits | None = None) -> None:
@@ -85,15 +85,15 @@ class PostWriteMonitor:
         self._rate: tuple[float, tuple[float, ...]] | None = None
         self._slow: tuple[float, ...] = (0.0, 0.0, 0.0)
         self._tilt = 0.0
-        self._raw = _Series()  # the distance from the setpoint, excused or not
-        self._excused = (math.inf, -math.inf)  # from when until when the mass changed, not the parameters
+        self._raw = _Series()  # distance from the setpoint, also during changes of mass
+        self._excused = (math.inf, -math.inf)  # start and end of the time in which a change of mass explains errors
         self._unwritten = False  # the new mass is not in the drone yet
         self._reference: Figures | None = None
         self._first = self._last = -math.inf
         self.newest = -math.inf
         self.unjudged = 0
 
-    # what is seen
+    # measurements
 
     def take(self, sample: Sample) -> None:
         """One sample of the flight."""
@@ -118,14 +118,14 @@ class PostWriteMonitor:
                 self._innovation.add(time, mean_square)
 
     def on_mass_step(self, *, began: float, now: float, real: bool | None) -> None:
-        """The mass changed at `began` [s], or may have (None), or has not after all (False).
+        """The mass changed at `began` [s] (True), may have changed (None), or did not change after all (False).
 
-        How far the drone is from its setpoint then says nothing about what was written, neither before nor after. Its
-        body rates go on being watched, and an alarm if it is very far.
+        The distance from the setpoint is then no evidence about a write, before or after it. The body rates and the
+        alarm for a very large distance remain active.
         """
         with self._lock:
             if real is None:
-                self._excused = (began, now + RETURN_SECONDS)  # an end, because the estimator that decides may stall
+                self._excused = (began, now + RETURN_SECONDS)  # with an end, because the estimator may stall
                 self._tracking.forget(began)
                 self._innovation.forget(began)
                 self.unjudged = min(self.unjudged, self.limits.unjudged - 1)  # the new mass does not wait for verdicts
@@ -162,24 +162,24 @@ class PostWriteMonitor:
         self._oscillation.add(time, math.dist(rate, self._slow) ** 2)
 
     def figures(self, start: float, end: float, fewest: int = FEWEST_VALUES) -> Figures:
-        """What was seen between two times [s]."""
+        """The figures between two times [s]."""
         return Figures(
             tracking=self._tracking.rms(start, end, fewest),
             speed=self._speed.rms(start, end, 1),
-            innovation=self._innovation.rms(start, end, 5),  # one an update
+            innovation=self._innovation.rms(start, end, 5),  # one per update
             oscillation=self._oscillation.rms(start, end, fewest),
         )
 
-    # what is judged
+    # verdicts
 
     @property
     def judging(self) -> bool:
-        """Whether a write is not yet judged."""
+        """Whether a write waits for a verdict."""
         return self._reference is not None
 
     @property
     def full(self) -> bool:
-        """Whether what was written has to be judged before more is."""
+        """Whether the next write must wait for a verdict."""
         return self.limits.enabled and self.unjudged >= self.limits.unjudged
 
     def on_write(self, begun: float, ended: float) -> None:
@@ -196,14 +196,14 @@ class PostWriteMonitor:
             self.unjudged += 1
 
     def forget(self) -> None:
-        """What was written is good, or undone."""
+        """End the judgement: the writes are good, or undone."""
         with self._lock:
             self._reference = None
             self._first = self._last = -math.inf
             self.unjudged = 0
 
     def judge(self, time: float) -> tuple[str, str]:
-        """At `time` [s]: ("", "") undecided or nothing to judge, ("good", figures) or ("worse", why)."""
+        """Verdict at `time` [s]: ("good", figures), ("worse", why), or ("", "") if undecided or nothing is to judge."""
         with self._lock:
             return self._judge(self._reference, self._last, time)
 
@@ -216,7 +216,7 @@ class PostWriteMonitor:
         start = last + self.limits.settle
         if self._excused[1] > self._first:
             start = max(start, self._excused[1])
-            if self._unwritten:  # it is off because of a mass that was not written, not because of what was
+            if self._unwritten:  # an unwritten mass causes the error, not the writes
                 before = replace(before, tracking=math.nan)
         if time - start < min(1.0, self.limits.after):
             return "", ""
@@ -227,7 +227,7 @@ class PostWriteMonitor:
         if time - start < self.limits.after:
             return "", ""
         if math.isnan(after.tracking) and math.isnan(after.oscillation):
-            return "", ""  # an outage: nothing was seen, so nothing is good yet
+            return "", ""  # an outage: no data, so no verdict
         return "good", f"{_said(before)} before, {_said(after)} after"
 
     def _alarm(self, before: Figures, time: float) -> str:
@@ -247,7 +247,7 @@ class PostWriteMonitor:
         return ""
 
     def _worse(self, before: Figures, after: Figures) -> str:
-        """Comparisons with NaN are false: what is not known is not worse."""
+        """Why the flight after is worse, "" if it is not. Comparisons with NaN are false: unknown is not worse."""
         limits = self.limits
         moving = limits.lead * max(_or(after.speed, 0.0) - _or(before.speed, 0.0), 0.0)
         allowed = max(limits.tracking_ratio * before.tracking, before.tracking + limits.tracking) + moving

@@ -1,6 +1,6 @@
-"""Writes the guard's decisions to the drone in a thread of its own, and keeps account of every echo.
+"""Writes the guard's decisions to the drone in its own thread, and records every echo.
 
-Every packet with a value passes the write gate, the repetitions included: an attempt sends one packet.
+Every packet with a value, also a repeated one, passes the write gate: each attempt sends one packet.
 """
 
 import math
@@ -18,15 +18,15 @@ from crazyem.live.write_gate import WriteGate
 from crazyem.vehicle import Vehicle
 
 ONBOARD_DRAG = ("kalman.dragB_x", "kalman.dragB_y")
-WRITE_TIMEOUT = 0.3  # s; an echo takes 2 to 30 ms on a working link, and the link does not send again so soon
-RETRY_PAUSE = 0.1  # s before the next attempt: a link that refuses at once is known as lost a little later
+WRITE_TIMEOUT = 0.3  # s; an echo takes 2 to 30 ms on a working link, and the link itself repeats only later
+RETRY_PAUSE = 0.1  # s before the next attempt: the loss of a link is noticed a little after a refusal
 WRITE_ATTEMPTS = 9  # of a write, 3.6 s in all: an outage is noticed within 2 s, and attempts during it do not count
-TELEMETRY_POLL = 0.01  # s between looks for fresh telemetry
+TELEMETRY_POLL = 0.01  # s between checks for fresh telemetry
 
 
 def push_target(link: Link, vehicle: Vehicle) -> tuple[Controller | None, str]:
-    """Where estimates can be pushed to on this drone now, or None and one sentence why not."""
-    number = int(link.read_parameter("stabilizer.controller"))  # freshly read: the firmware may overrule
+    """The target of pushes on this drone and a note; or None and one sentence why there is none."""
+    number = int(link.read_parameter("stabilizer.controller"))  # a fresh read: the firmware may select another one
     plain = CONTROLLERS.get(number)
     if plain is None:
         return None, without_target(number)
@@ -42,34 +42,34 @@ def push_target(link: Link, vehicle: Vehicle) -> tuple[Controller | None, str]:
 
 
 def read_originals(link: Link, controller: Controller) -> dict[str, float]:
-    """The values of every parameter a push may write, as the drone has them now."""
+    """The present values of every parameter that a push may write."""
     return {name: link.read_parameter(name) for name in controller.parameters}
 
 
 def nominal_estimates(vehicle: Vehicle, controller: Controller) -> dict[str, float]:
-    """What the vehicle file says of everything that may be pushed [SI]: the centre of the allowed ranges."""
+    """Values of the vehicle file for all estimates that may be pushed [SI]: the centres of the allowed ranges."""
     values = (vehicle.mass, *vehicle.inertia, vehicle.motor_time_constant)
     return dict(zip(("mass", "Ixx", "Iyy", "Izz", "motor_time_constant"), values)) | dict(controller.known)
 
 
 class Pusher:
-    """One thread, one write at a time, in the order decided.
+    """Writes decisions in one thread, one write at a time, in their order.
 
-    A write that is not confirmed is tried again, after an outage once the link is back: writing the same value twice
-    does no harm. If it stays unconfirmed, the set it belongs to is undone as far as the drone still answers, because a
-    set must not stay half written, and all pushing ends. A set of which the gate lets nothing pass is dropped, and the
-    guard decides anew.
+    An unconfirmed write is tried again, after an outage once the link is back: writing the same value twice does no
+    harm. If it stays unconfirmed, all pushing ends, and its set is undone as far as the drone answers, because a set
+    must not stay incomplete. If the gate refuses the first write of a set, the set is dropped and the guard decides
+    again.
 
     Args:
         link: to the drone.
-        guard: told to stop when a write is not confirmed.
-        gate: asked before every single packet.
+        guard: is stopped after an unconfirmed write.
+        gate: checked before every packet.
         history: keeps every write.
         on_write: called with every write (recording).
-        wait_for_link: waits while the link is being brought back; False if it is lost for good.
-        outages: how often the link was lost so far, the present time included.
-        known: what the drone holds, by parameter, as read at connect. Without it nothing can be undone.
-        on_done: called after each decision with it and one clause why not all of it is in the drone, "" if it is.
+        wait_for_link: waits during a reconnection; False if the link is lost for good.
+        outages: number of losses of the link, including a present one.
+        known: parameter values in the drone, as read at connect. Without them nothing can be undone.
+        on_done: called after each decision with the decision and one clause why it is not complete, "" if it is.
     """
 
     def __init__(
@@ -104,18 +104,17 @@ class Pusher:
 
     @property
     def busy(self) -> bool:
-        """Whether something is queued or being written."""
+        """Whether a decision is queued or being written."""
         return self._pending > 0
 
     def submit(self, decision: Decision) -> None:
-        """Queue a decision's writes; returns at once. Of a revert or restore only what differs is written."""
+        """Queue a decision's writes; returns at once. A revert or restore writes only values that differ."""
         with self._lock:
             self._pending += 1
         self._queue.put(decision)
 
     def close(self) -> None:
-        """Finish the set that is being written and a restore that is queued, then end; bounded by the time that one
-        write and its undoing may take."""
+        """Finish the present set and a queued restore, then end; waits at most as long as a write and its undo take."""
         self._queue.put(None)
         self._thread.join(timeout=2 * WRITE_ATTEMPTS * (self.timeout + 2 * RETRY_PAUSE) + 1.0)
         if self._thread.is_alive():
@@ -126,7 +125,7 @@ class Pusher:
             why = ""
             try:
                 why = self._push(decision) if decision.kind == "push" else self._write_back(decision)
-            except Exception as error:  # a fault of ours: what it leaves is not known, so nothing more is pushed
+            except Exception as error:  # an internal error: the drone's values are unknown, so pushing ends
                 why = f"pushing failed: {error!r}"
                 self.guard.stop(why)
                 self.history.notice(f"{why}: nothing more is pushed.")
@@ -136,7 +135,7 @@ class Pusher:
             self.on_done(decision, why)
 
     def _push(self, decision: Decision) -> str:
-        """Why not all of a set was confirmed, "" if it was; what was begun is completed or undone."""
+        """Write a set completely or undo it; returns why it was not confirmed, "" if it was."""
         if self.guard.stopped:
             return self.guard.stopped
         before = dict(self.known)
@@ -156,11 +155,11 @@ class Pusher:
         return ""
 
     def _undo(self, decision: Decision, before: Mapping[str, float], *, touched: Sequence[str]) -> None:
-        """Back to the values before the set, one that was not confirmed included: it may have arrived."""
+        """Write the values from before the set, also for an unconfirmed write, because it may have arrived."""
         if not all(name in before for name in touched):
             return
         lost = [name for name in touched if math.isnan(self.known[name])]
-        # For the order it counts as written; the way back is then the way there, reversed.
+        # For the order, an unconfirmed write counts as written; so the order of the undo is that of the set, reversed.
         now = {**self.known, **{name: dict(decision.writes)[name] for name in lost}}
         target = {name: before[name] for name in touched}
         for name, value in writes_back(self.guard.controller, target, now=now, uncertain=lost):
@@ -169,7 +168,7 @@ class Pusher:
         self.history.notice("the set of parameters it belongs to was undone.")
 
     def _write_back(self, decision: Decision) -> str:
-        """Why the drone does not hold the values of a revert or restore, "" if it does."""
+        """Write the values of a revert or restore; returns why the drone does not have them, "" if it does."""
         target = dict(decision.writes)
         for name, value in writes_back(self.guard.controller, target, now=self.known):
             if why := self._put_back(decision, name, value, purpose=decision.kind):
@@ -177,7 +176,7 @@ class Pusher:
         return ""
 
     def _put_back(self, decision: Decision, name: str, value: float, *, purpose: str) -> str:
-        """Why a value was not put back, "" if it was."""
+        """Write an old value; returns why this failed, "" if it did not."""
         why, sent = self._write(decision.time, name, value, purpose=purpose)
         if why:
             held = self.known.get(name, math.nan)
@@ -190,9 +189,9 @@ class Pusher:
     def _write(
         self, time: float, name: str, value: float, *, purpose: str = "push", patient: bool = True
     ) -> tuple[str, bool]:
-        """Why a write was not confirmed, "" if it was, and whether a packet may have left.
+        """Write a value; returns why it was not confirmed ("" if it was), and whether a packet may have been sent.
 
-        `patient`: wait for telemetry that is not fresh; else such a write is not begun.
+        `patient`: wait for fresh telemetry; else the write is not begun without it.
         """
         why, sent, failed = "no echo came", False, 0
         for attempt in range(2 * WRITE_ATTEMPTS):
@@ -209,7 +208,7 @@ class Pusher:
             else:
                 sent = True
                 why = self._attempt(name, value)
-            # One during which the link was lost was none: an outage is noticed two seconds after its last packet.
+            # An attempt during which the link was lost does not count.
             failed += self.outages() == outages
             if not why or failed == WRITE_ATTEMPTS:
                 break
@@ -220,7 +219,7 @@ class Pusher:
         return why, sent
 
     def _refused(self, purpose: str, *, patient: bool) -> tuple[str, bool]:
-        """Why the gate does not let a write pass, "" if it does, and whether that is final."""
+        """Why the gate refuses a write ("" if it does not), and whether the refusal is final."""
         until = clock.monotonic() + self.timeout
         while (why := self.gate.stale()) and patient and clock.monotonic() < until:
             clock.sleep(TELEMETRY_POLL)
@@ -230,11 +229,11 @@ class Pusher:
         return why, bool(why)
 
     def _attempt(self, name: str, value: float) -> str:
-        """Send it once; "" if the drone confirmed it, else why not."""
+        """Send a write once; returns "" if the drone confirms it, else why not."""
         try:
             write = self.link.write_parameter(name, value, timeout=self.timeout)
-        except Exception as error:  # a fault of ours ends the pushing, not the flight; the sentence names it
-            # of the write nothing is known: its packet may have left before the link failed
+        except Exception as error:  # an internal error ends the pushing, not the flight; the sentence names it
+            # the packet may have been sent before the link failed
             self._record(ParameterWrite(name, value, None, False, clock.time()))
             return (str(error) or type(error).__name__) if isinstance(error, CrazyemError) else repr(error)
         self._record(write)
@@ -246,6 +245,6 @@ class Pusher:
         try:
             if self.on_write is not None:
                 self.on_write(write)
-        except Exception as error:  # the set is completed, but nothing is written that cannot be recorded
+        except Exception as error:  # the set is completed, but then pushing ends: all writes must be recorded
             self.guard.stop(f"a write could not be recorded: {error!r}")
             self.history.notice(f"a write could not be recorded ({error!r}): nothing more is pushed.")

@@ -1,4 +1,4 @@
-"""What a session tells a recording: the interface that the flight loop writes through, and our MCAP file behind it."""
+"""The interface between a session and its recording, and functions to open and close an MCAP recording."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from crazyem.vehicle import Vehicle
 
 
 class Recorder(Protocol):
-    """Called from several threads; every call returns at once."""
+    """Interface of a recording. It is called from several threads; every call returns at once."""
 
     path: str
     failure: str
@@ -32,7 +32,7 @@ class Recorder(Protocol):
 
 @runtime_checkable
 class FrameRecorder(Protocol):
-    """A recorder that also takes a drone's messages as they came."""
+    """A recorder that also takes a drone's raw messages."""
 
     def frame(self, host_time: float, data: bytes) -> None: ...
 
@@ -45,7 +45,7 @@ def open_recorder(
     Args:
         configuration: of the run; values are stored as JSON.
         vehicle: its file's text is stored, so that a replay starts from the same constants.
-        link: connected; its tables and what the firmware says of itself are stored, as far as it knows them.
+        link: connected; its tables and the firmware's description of itself, if known, are stored.
         append: continue an existing recording as its next session (after a reconnect) instead of replacing it.
 
     Raises: UsageError: the file cannot be created. FileFormatError: it cannot be continued.
@@ -71,7 +71,7 @@ def open_recorder(
 
 
 def close_recorder(recorder: Recorder, statistics: LinkStatistics, history: History) -> None:
-    """Finish the recording, with the account of lost packets in it; say so if it is not whole."""
+    """Add the counts of packets to the recording and close it; adds a notice if the recording failed."""
     counts = {n: getattr(statistics, n) for n in ("received", "lost", "late", "duplicates")}
     recorder.metadata("statistics", {k: str(v) for k, v in counts.items()})
     recorder.close()

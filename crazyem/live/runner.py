@@ -1,4 +1,4 @@
-"""A session from a URI to its result: what `fly` and `watch` share."""
+"""Functions from a URI to the result of a session, common to `fly` and `watch`."""
 
 import contextlib
 from collections.abc import Callable, Mapping
@@ -49,11 +49,11 @@ def open_session(
     Args:
         left_out: effects of the vehicle file that the estimator does not know.
         configuration: of the run, for the recording.
-        record, append: path of the recording, None: none; continue an existing one.
-        rate: of the log, Hz. reconnect: how long a lost link is tried again, s.
+        record: path of the recording; None: no recording. append: continue an existing one.
+        rate: of the log, Hz. reconnect: s, longest time to reconnect a lost link.
         wrench: log group of the controller whose commanded thrust and torque are recorded.
-        scheduler: of updates where drones are many. monitor: of faults in flight; on_fault: takes its reports.
-        wrap: adds what else takes the recorder's messages, such as a live stream.
+        scheduler: of updates for many drones. monitor: of faults in flight; on_fault: takes its reports.
+        wrap: adds other receivers of the recorder's messages, such as a live stream.
     """
     recorder = wrap(open_recorder(record, configuration=configuration, vehicle=vehicle, link=link, append=append))
     if recorder is not None:
@@ -78,7 +78,7 @@ def open_session(
 def finished(
     session: Session, *, title: str, log: str | None, extra: Mapping[str, Any], error: BaseException | None
 ) -> tuple[FlightResult | None, BaseException | None]:
-    """Close the recording of a closed session; its result, and the first error: `error`, or that of the result."""
+    """Close the recording of a closed session; returns its result and the first error (`error`, or the result's)."""
     statistics = session.link.statistics()
     if session.recorder is not None:
         close_recorder(session.recorder, statistics, session.history)

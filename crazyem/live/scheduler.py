@@ -1,9 +1,9 @@
-"""Receiving and estimating for many drones at once: a few threads, and updates left out when they cannot keep up.
+"""Receiving and estimating for many drones at once with a few threads; late estimators skip updates.
 
-One thread takes in what arrives for all: with a thread a drone, waking them costs more than their work. A worker takes
-the drone that has waited longest and gives its estimator what has arrived. Kernels release the interpreter lock, so as
-many updates run at a time as there are workers. Where that is not enough, updates are left out, never samples: the
-next update uses them all.
+One thread receives packets for all drones, because waking one thread for each drone costs more than the work itself. A
+worker takes the drone that has waited longest and gives its samples to its estimator. Kernels release the interpreter
+lock, so each worker can run an update at the same time. If this is too slow, updates are skipped, but never samples:
+the next update uses all of them.
 """
 
 import math
@@ -20,19 +20,19 @@ from crazyem.live.pipeline import residual_of
 from crazyem.signals.sample import Sample
 
 POLL_PAUSE = 0.002  # s between two rounds of receiving: a twentieth of an update's budget
-TIME_SLICE = 0.01  # s a worker stays with one drone while others wait
-LONGEST_DEFERRAL = 1.0  # s of the drone's clock after which an update is made however late it comes
-NO_UPDATE = 1 << 30  # samples between updates: none
-FULL_PASSES_EVERY = 12  # updates; the costly ones of several drones should not fall together,
-MANY_DRONES = 5  # beyond so many they come more rarely, unless something moves,
-MANY_DRONES_FULL_PASSES_EVERY = 100  # updates
+TIME_SLICE = 0.01  # s, longest work for one drone while others wait
+LONGEST_DEFERRAL = 1.0  # s of the drone's clock, longest time without an update
+NO_UPDATE = 1 << 30  # samples between updates that mean no update
+FULL_PASSES_EVERY = 12  # updates between costly full passes, which are spread over the drones
+MANY_DRONES = 5  # with more drones, full passes are less frequent
+MANY_DRONES_FULL_PASSES_EVERY = 100  # updates between full passes then
 
 
 class Mailbox:
-    """What has arrived for one drone; worked off in order, by one worker at a time.
+    """Queue of received items of one drone; one worker at a time processes them in order.
 
     Args:
-        work: takes an item; an exception ends the mailbox, and goes to `failed`.
+        work: processes an item; an exception ends the mailbox and goes to `failed`.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class Mailbox:
         self._idle.set()
 
     def put(self, item: Any) -> None:
-        """One more item; returns at once."""
+        """Add an item; returns at once."""
         with self._lock:
             if self._ended:
                 return
@@ -59,11 +59,11 @@ class Mailbox:
         self._scheduler.enqueue(self)
 
     def wait(self, timeout: float) -> bool:
-        """Until everything was worked off, at most `timeout` [s]; whether it was."""
+        """Wait at most `timeout` [s] until all items are processed; returns whether they are."""
         return self._idle.wait(timeout)
 
     def run_slice(self) -> None:
-        """Work off items for a while (a worker's thread)."""
+        """Process items for at most `TIME_SLICE` (in a worker's thread)."""
         until = time.monotonic() + TIME_SLICE
         while True:
             with self._lock:
@@ -83,11 +83,11 @@ class Mailbox:
                 return
             if time.monotonic() >= until:
                 break
-        self._scheduler.enqueue(self)  # behind those that wait
+        self._scheduler.enqueue(self)  # behind the other waiting mailboxes
 
 
 class PacketPoller:
-    """One thread that goes round all drones and takes in what has arrived for each."""
+    """One thread that receives packets of all drones in turn."""
 
     def __init__(self) -> None:
         self._sources: tuple[Callable[[], bool], ...] = ()
@@ -98,13 +98,13 @@ class PacketPoller:
         self._thread.start()
 
     def add(self, take_in: Callable[[], bool]) -> None:
-        """Call `take_in` again and again from now on; it must not block, and returns whether there was anything."""
+        """Call `take_in` repeatedly from now on; it must not block, and returns whether it received something."""
         with self._lock:
             self._sources = (*self._sources, take_in)
         self._wanted.set()
 
     def remove(self, take_in: Callable[[], bool]) -> None:
-        """Not any more; a call that is under way is waited for."""
+        """Stop the calls of `take_in`; waits for a running call."""
         with self._lock:
             self._sources = tuple(s for s in self._sources if s != take_in)
 
@@ -121,15 +121,15 @@ class PacketPoller:
                 self._wanted.clear()
             with self._lock:
                 some = [take_in() for take_in in self._sources]
-            # also a pause where there was something: packets that come singly would each cost a round
+            # a pause in any case: without it, each single packet would cost a round
             time.sleep(POLL_PAUSE if any(some) else 2 * POLL_PAUSE)
 
 
 class Scheduler:
-    """Threads that work for all mailboxes, first come, first served, and the one that receives for all (`rounds`).
+    """Worker threads for all mailboxes, first come, first served, and the receiving thread (`poller`).
 
     Args:
-        workers: None takes one a core.
+        workers: number of threads; None: one for each core.
     """
 
     def __init__(self, workers: int | None = None) -> None:
@@ -143,15 +143,15 @@ class Scheduler:
         self.poller = PacketPoller()
 
     def mailbox(self, work: Callable[[Any], None], failed: Callable[[Exception], None]) -> Mailbox:
-        """A new one; see `Mailbox`."""
+        """A new mailbox; see `Mailbox`."""
         return Mailbox(self, work, failed)
 
     def enqueue(self, mailbox: Mailbox) -> None:
-        """A mailbox waits for a worker (called by mailboxes)."""
+        """Queue a mailbox for a worker (called by mailboxes)."""
         self._ready.put(mailbox)
 
     def close(self) -> None:
-        """End the threads; what is in mailboxes by then stays there."""
+        """End the threads; remaining items in mailboxes are not processed."""
         self.poller.close()
         for _ in self._threads:
             self._ready.put(None)
@@ -164,16 +164,16 @@ class Scheduler:
 
 
 class UpdateThrottle:
-    """An estimator that leaves updates out while it is late, and whose updates are out of step with the others'.
+    """An estimator that skips updates while it is late, and that updates at other times than those of other drones.
 
     Args:
         inner: an OnlineEstimator, or one with its `feed`, `finish`, `share_computer` and the attribute `every`.
-        number, of: this drone among all: shifts its first update by a share of a full round of updates.
-        late: s behind the newest packet at which an update is left out; None takes an update's share of time at 100 Hz.
+        number, of: number of this drone and number of drones; they shift its first update.
+        late: s behind the newest packet from which updates are skipped; None: the time between updates at 100 Hz.
 
     Attributes:
-        skipped: updates left out.
-        behind: s from the newest sample fed to the newest packet received.
+        skipped: number of skipped updates.
+        behind: s from the newest processed sample to the newest received packet.
     """
 
     def __init__(self, inner: Any, *, number: int = 0, of: int = 1, late: float | None = None) -> None:
@@ -187,7 +187,7 @@ class UpdateThrottle:
         self._phase = round(
             number * self._every * (MANY_DRONES_FULL_PASSES_EVERY if of > MANY_DRONES else FULL_PASSES_EVERY) / of
         )
-        self._held = 0  # samples of one signal for which an update was due and none was made
+        self._held = 0  # samples of position since updates are skipped
         self._last = math.nan
         self._time = math.nan
         self._hold = False
@@ -195,7 +195,7 @@ class UpdateThrottle:
 
     @property
     def every(self) -> int:
-        """Samples between updates, as asked for."""
+        """Samples between updates if none is skipped."""
         return self._every
 
     @property
@@ -211,12 +211,12 @@ class UpdateThrottle:
 
     @property
     def residual(self) -> Any:
-        """Of the inner estimator, None where it has none."""
+        """Of the inner estimator, None if it has none."""
         return residual_of(self.inner)
 
     def feed(self, sample: Sample) -> Estimate | None:
         """One sample; see `OnlineEstimator.feed`."""
-        if sample.time != self._time:  # an instant has several samples; the first of the next one makes updates
+        if sample.time != self._time:  # an instant has several samples; its first one may cause an update
             self._begin(sample.time)
         estimate: Estimate | None = self.inner.feed(sample)
         if self._hold and sample.signal == "position":
@@ -228,7 +228,7 @@ class UpdateThrottle:
         return estimate
 
     def _begin(self, time: float) -> None:
-        """Whether an update may be made when the samples of `time` [s] begin to come in."""
+        """Decide whether an update may be made at the samples of `time` [s]."""
         self._time = time
         if math.isnan(self._last):
             self._last = time
@@ -237,7 +237,7 @@ class UpdateThrottle:
         self.inner.every = NO_UPDATE if self._hold else self._every + self._phase
 
     def finish(self) -> Estimate:
-        """The final estimate, whatever it takes."""
+        """The final estimate, without skipping."""
         self.inner.every = self._every
         estimate: Estimate = self.inner.finish()
         return estimate

@@ -1,7 +1,7 @@
-"""A running estimate over an open link: packets in, samples through the pipeline, everything recorded on the way.
+"""A running estimation over an open link: packets become samples, go through the pipeline, and are recorded.
 
-Threads: one receives (records, keeps clock and telemetry; cheap, so flying is never blind), one estimates, one writes
-parameters. Setpoints have a thread of their own (stream.py). None of them waits for another. Where one process has many
+Threads: one receives (records, updates clock and telemetry; it is fast, so telemetry is always fresh), one estimates,
+one writes parameters. Setpoints have their own thread (stream.py). No thread waits for another. In a process with many
 sessions, a scheduler receives and estimates for all of them (scheduler.py).
 """
 
@@ -46,12 +46,12 @@ from crazyem.signals.sample import Sample
 from crazyem.signals.vocabulary import block_plan, decoders
 from crazyem.vehicle import Vehicle
 
-# Every 11 ms: in step with the onboard estimate, predicted every 10 ms, logged commands are off by the same part of a
-# step for seconds (docs/explanation/estimator.md, In step).
+# 11 ms, not 10 ms, which is the period of the onboard estimator's prediction: with equal periods, logged commands have
+# a constant error of a part of a step for seconds (docs/explanation/estimator.md, In step).
 LOG_RATE = 1000.0 / 11.0  # Hz
-LINK_RECORD_PERIOD = 1.0  # s between notes on the link's health
-# A drone under low-level setpoints levels out after 0.5 s without them and cuts its motors after 2 s; one that hovers
-# by itself goes on. So a link is worth waiting for, but not for long.
+LINK_RECORD_PERIOD = 1.0  # s between records of the link's statistics
+# Without low-level setpoints a drone levels out after 0.5 s and cuts its motors after 2 s; a drone that hovers by
+# itself goes on. So a reconnection is useful, but only for a short time.
 RECONNECT_WITHIN = 8.0  # s
 
 
@@ -65,10 +65,10 @@ class Session:
         recorder: or None.
         wrench: log group of the controller whose commanded thrust and torque are recorded.
         on_estimate: called in the estimator's thread with every estimate.
-        rate: of the log, Hz; beyond 100 the firmware must start blocks by the millisecond.
-        reconnect_within: s for which a lost link is tried again, 0 = never. The window is kept: the estimator sees the
-            gap in the stamps and begins a new stretch after it.
-        scheduler: whose threads receive and estimate, where one process has many sessions; None: threads of its own.
+        rate: of the log, Hz; above 100 the firmware must allow block periods in milliseconds.
+        reconnect_within: s, longest time to reconnect a lost link, 0 = never. The window is kept: the estimator begins
+            a new stretch after the gap in the stamps.
+        scheduler: its threads receive and estimate, for many sessions in one process; None: the session's own threads.
         monitor: of faults in flight; on_fault: called in the estimator's thread with its reports.
     """
 
@@ -104,7 +104,7 @@ class Session:
         self._wrench = wrench
         self._on_estimate = on_estimate
         self._on_fault = on_fault or (lambda fault: None)
-        self.landing_wanted = ""  # why the drone is to land at once, by the policy
+        self.landing_wanted = ""  # why the drone must land at once, by the policy
         if monitor is not None:
             monitor.on_fault = self._found_fault
         self.pipeline = Pipeline(estimator, history=self.history, on_estimate=self._estimated, monitor=monitor)
@@ -116,7 +116,7 @@ class Session:
             scheduler.mailbox(self._feed, self._estimating_failed) if scheduler is not None else None
         )
         self._receiving_ended = False  # nothing is received any more
-        self._reconnection: threading.Thread | None = None  # a lost link, for a scheduler: its thread must not wait
+        self._reconnection: threading.Thread | None = None  # with a scheduler only: its thread must not wait
         self._link_recorded = -math.inf
         self._end_wanted = self._closed = False
         self._stop = threading.Event()
@@ -128,14 +128,14 @@ class Session:
         return self.history.estimates[-1] if self.history.estimates else None
 
     def start(self) -> None:
-        """Subscribe and let packets flow."""
+        """Subscribe to log blocks and start the threads."""
         blocks: list[Block] = []
         if isinstance(self.link, StreamingLink):
             if isinstance(self.recorder, FrameRecorder):
                 self.link.on_frame = self.recorder.frame
             blocks.extend(self.link.start_streams(self.rate))
         else:
-            # Threads first: packets of the first block must not pile up behind the set-up of the last.
+            # Each block sends packets from its subscription on.
             for variables in block_plan(tuple(self.link.log_variables), wrench=self._wrench):
                 blocks.extend(self.link.subscribe(variables, self.rate))
         self.blocks = tuple(blocks)
@@ -152,10 +152,10 @@ class Session:
             self._threads.append(thread)
 
     def push_to_controller(self, rules: WriteRules | None = None) -> str:
-        """Let the guard push to the controller that runs now; returns a sentence if there is anything to say.
+        """Let the guard push to the active controller; returns a sentence for the user, or "".
 
         Args:
-            rules: policy, dry run, confirmation; the shipped policy without.
+            rules: policy, dry run, confirmation; None: the shipped policy.
         """
         rules = rules or WriteRules(load_policy())
         if isinstance(self.link, HoverThrustLink):
@@ -205,19 +205,19 @@ class Session:
         return note
 
     def stop_pushing(self, *, motors_cut: bool = False) -> None:
-        """Begin no new set of writes: the first step of every way out. motors_cut: nor complete one."""
+        """Begin no new set of writes, as the first step of every end. motors_cut: do not complete a set either."""
         if self.write_supervisor is not None:
             self.write_supervisor.stop(motors_cut=motors_cut)
 
     def end_pushing(self, outcome: str) -> None:
-        """The flight is over, `landed`, `interrupted`, `failed` or `link_lost`: keep or restore, as the policy says."""
+        """The flight has ended (`landed`, `interrupted`, `failed`, `link_lost`): keep or restore, by the policy."""
         if self.write_supervisor is not None:
             self.write_supervisor.end(outcome)
 
     def end_estimates(self) -> None:
-        """Keep what comes from now on out of the estimate: a landing excites little and ends near the ground.
+        """Leave later samples out of the estimate: a landing excites little and ends near the ground.
 
-        The receiving thread draws the line between two packets and records it, so that a replay draws the same.
+        The receiving thread sets the end time between two packets and records it, so that a replay uses the same.
         """
         self._end_wanted = True
 
@@ -229,7 +229,7 @@ class Session:
             self.recorder.event(f"mark estimate_end {until!r}")
 
     def raise_if_failed(self) -> None:
-        """Raise what went wrong in a thread, or that the drone is lost."""
+        """Raise the error of a thread, or LinkError if the drone is lost."""
         if self.failure is not None:
             raise self.failure
         if self.lost is not None:
@@ -248,10 +248,10 @@ class Session:
         return f"{reason[:1].lower()}{reason[1:]}{tail}."
 
     def close(self) -> None:
-        """End the writes, stop receiving, let the estimator finish what has arrived. Does not close the link.
+        """End the writes, stop receiving, and let the estimator finish the received samples. The link stays open.
 
-        In this order: as long as anything may be written, telemetry goes on, so that the write gate knows where the
-        drone is; and what the estimator finishes afterwards is not pushed any more.
+        The order matters: the write gate needs telemetry as long as writes are possible, and the estimates at the end
+        must not be pushed.
         """
         if self._closed:
             return
@@ -283,7 +283,7 @@ class Session:
             self._on_estimate(estimate)
 
     def _found_fault(self, fault: Fault) -> None:
-        """Tell it to everybody; the settled report of a fault comes after the first."""
+        """Report a fault to recording, history and callback; its settled report comes after the first one."""
         for line in event_lines(fault):
             self._record_event(line)
         if fault.settled:
@@ -310,7 +310,7 @@ class Session:
             self._samples.put(None)
 
     def _take_in(self) -> bool:
-        """What has arrived, for a scheduler's thread; whether there was anything. Never waits."""
+        """Process received packets in a scheduler's thread, without waiting; returns whether there were any."""
         if self._reconnection is not None:
             if self._reconnection.is_alive():
                 return False
@@ -343,7 +343,7 @@ class Session:
             self._linked.set()
 
     def _receiving_failed(self, error: Exception) -> None:
-        """A fault of ours must reach the flight as well: it has to land."""
+        """Store an internal error, so that the flight ends with a landing."""
         self._receiving_ended = True
         self.telemetry.heard = -math.inf
         self.stop_pushing()
@@ -355,12 +355,12 @@ class Session:
         return not self._linked.is_set()
 
     def wait_for_link(self) -> bool:
-        """Until the link is there, or lost for good; whether it is there. At once where nothing is amiss."""
+        """Wait until the link is back or lost for good; returns whether it works. Returns at once without an outage."""
         self._linked.wait(self.reconnect_within + 5.0)
         return self._linked.is_set() and self.lost is None
 
     def _reconnect(self, lost: LinkLost) -> bool:
-        """Bring the link back; there is nothing to receive meanwhile. False: lost for good."""
+        """Reconnect the link; nothing is received during this time. False: the link is lost for good."""
         self.telemetry.heard = -math.inf
         link = self.link
         if not isinstance(link, ReconnectingLink) or not link.can_reconnect or self.reconnect_within <= 0.0:
@@ -402,7 +402,7 @@ class Session:
         self.clock.observe(packet.firmware_time_ms / 1000.0)
         names = self._names.get(packet.block)
         if names is None:
-            return  # a block of somebody else's
+            return  # a block of another client
         if self.recorder is not None:
             self.recorder.packet(packet)
             if packet.host_time - self._link_recorded >= LINK_RECORD_PERIOD:
@@ -428,7 +428,7 @@ class Session:
         (self._samples if self._mailbox is None else self._mailbox).put(samples)
 
     def _record_link(self, packet: Packet) -> None:
-        """The link's health, into the recording; latency against the promptest packets, where the link knows them."""
+        """Record the link's statistics, and the latency against the fastest packets if the link has a clock fit."""
         assert self.recorder is not None
         fit = self.link.clock() if isinstance(self.link, ClockedLink) else None
         late = math.nan if fit is None else packet.host_time - fit.to_host(packet.firmware_time_ms)

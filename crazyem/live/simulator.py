@@ -1,4 +1,4 @@
-"""Starts and stops the simulated firmware as a process of its own; nothing but its address comes back."""
+"""Starts and stops the simulated firmware in its own process; the process returns only its address."""
 
 import atexit
 import contextlib
@@ -18,17 +18,17 @@ START_TIMEOUT = 180.0  # s; the first start on a machine compiles the plant's ke
 
 
 class Simulator:
-    """`python -m firmware_sim` on a free port of this host, for the length of a `with` block.
+    """`python -m firmware_sim` on a free port of this host, during a `with` block.
 
     Args:
-        scenario: the truth, a file only the simulator reads; None for its defaults.
-        seed: of every noise in it.
+        scenario: file with the true values, read only by the simulator; None for its defaults.
+        seed: of all its noise.
         speed: firmware seconds per second.
-        command: what to start instead (tests).
+        command: another command to start (tests).
 
     Raises:
-        FileFormatError: it refused its scenario (its own sentence).
-        CrazyemError: it did not start.
+        FileFormatError: the simulator refused its scenario (with its own sentence).
+        CrazyemError: the simulator did not start.
     """
 
     def __init__(
@@ -59,15 +59,15 @@ class Simulator:
         self.stop()
 
     def launch(self) -> None:
-        """Start the process without waiting for it: it may have to compile, which others can do meanwhile."""
-        # A session of its own: Ctrl-C in the terminal must land the drone, not kill the firmware under it.
+        """Start the process without waiting, so that several simulators can compile at the same time."""
+        # In its own session: Ctrl-C in the terminal must land the drone, not end its firmware.
         self._process = subprocess.Popen(
             self._command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
         )
         atexit.register(self.stop)
 
     def start(self) -> str:
-        """Start if it is not launched, wait until it answers, return its URI."""
+        """Launch the process if needed, wait until it answers, and return its URI."""
         if self._process is None:
             self.launch()
         process = self._process

@@ -1,4 +1,4 @@
-"""Streams setpoints at a steady rate of the firmware's clock, in a thread nothing else can delay."""
+"""Streams setpoints at a constant rate of the firmware's clock, in a separate thread."""
 
 import threading
 import time
@@ -10,22 +10,22 @@ from crazyem.errors import LinkError
 from crazyem.links.base import Link
 from crazyem.live.clock import FirmwareClock
 
-# Each setpoint makes a step in the commanded torques. Sent at the rate of the log (100 Hz), the steps would keep their
-# place between two log samples and the logged motor commands would be off by a constant part of every step: measured,
-# 6 % of the yaw torque, which goes straight into Izz. Seven milliseconds visit every place within 70 ms.
+# Each setpoint makes a step in the commanded torques. At the rate of the log (100 Hz), every step would be at the same
+# time between two log samples, and the logged motor commands would have a constant error: 6 % of the yaw torque, which
+# goes directly into Izz. With 7 ms, the steps cover all times between log samples within 70 ms.
 SETPOINT_PERIOD = 0.007  # s of firmware time
-LARGEST_LEAP = 0.5  # s of the trajectory from one setpoint to the next after an outage that are too many
-OUTAGE_NOTICE_SECONDS = 0.3  # s from the loss of a link until the session knows of it
-SHORTEST_PERIOD = 0.0005  # s of host time; below this a fast simulator gets setpoints further apart
+LARGEST_LEAP = 0.5  # s, largest jump of the trajectory's time between two setpoints, after an outage
+OUTAGE_NOTICE_SECONDS = 0.3  # s from the loss of a link until the session notices the loss
+SHORTEST_PERIOD = 0.0005  # s of host time, shortest period: limits the rate for a fast simulator
 
 
 class SetpointStream:
-    """Sends `trajectory` from `start()` until `stop()`; holds its end point after its duration.
+    """Sends `trajectory` from `start()` until `stop()`; after its duration, its end point.
 
     Args:
         on_setpoint: called with (firmware time [s], reference) after each setpoint (recording).
-        indi: gains of INDI, which then gets places ahead of the reference; None: full-state setpoints.
-        returning: whether a lost link is being brought back; a setpoint that cannot be sent meanwhile is left out.
+        indi: gains of INDI, which gets positions ahead of the reference; None: full-state setpoints.
+        reconnecting: whether a lost link is being reconnected; setpoints that cannot be sent then are skipped.
     """
 
     def __init__(
@@ -54,12 +54,12 @@ class SetpointStream:
         self._thread = threading.Thread(target=self._run, name="crazyem-setpoints", daemon=True)
 
     def start(self) -> None:
-        """Begin; the trajectory's time 0 is now, on the firmware's clock."""
+        """Begin; time 0 of the trajectory is the present time of the firmware's clock."""
         self.began = self.clock.now()
         self._thread.start()
 
     def stop(self) -> None:
-        """Send no more; returns when the thread has ended."""
+        """Send no more setpoints; waits for the thread to end, at most 2 s."""
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join(timeout=2.0)
@@ -87,7 +87,7 @@ class SetpointStream:
             self.failure = error
 
     def _progress(self, firmware: float) -> float:
-        """The trajectory's time [s]; after an outage it goes on where it stood: a leap shakes the drone."""
+        """The trajectory's time [s]; after an outage it continues from its last value: a jump shakes the drone."""
         progress = firmware - self.began
         if self.reconnecting():
             self._after_outage = True
@@ -98,14 +98,14 @@ class SetpointStream:
         return progress
 
     def _send(self, r: Reference) -> bool:
-        """Whether it left; raises LinkError if it did not and nobody is bringing the link back."""
+        """Send a setpoint; returns whether it was sent. Raises LinkError if it was not and no reconnection runs."""
         try:
             if self.indi is not None:
                 self.link.send_position(*place_ahead(r, self.indi))
             else:
                 self.link.send_full_state(r.position, r.velocity, r.acceleration, r.quaternion, (0.0, 0.0, r.yaw_rate))
         except LinkError as error:
-            # The link reports its loss through the queue of packets: give whoever reads it a moment to act on it.
+            # The link reports its loss through the queue of packets: give the reader of the queue time to react.
             until = time.monotonic() + OUTAGE_NOTICE_SECONDS
             while not self.reconnecting():
                 if time.monotonic() > until or self._stop.is_set():

@@ -74,7 +74,7 @@ def write_json(summary: Mapping[str, Any], path: str) -> None:
 
 
 def check_writable(path: str | None) -> None:
-    """Find out before the flight, not after it, that a result cannot be written.
+    """Check before the flight that a result can be written after it.
 
     Raises: UsageError: the file cannot be opened for writing.
     """
@@ -87,7 +87,7 @@ def check_writable(path: str | None) -> None:
         if target.exists() and not target.is_file():
             return  # a device or a pipe: opening it may block
         existed = target.exists()
-        with target.open("ab"):  # the only test that is right about permissions, full disks and strange file systems
+        with target.open("ab"):  # only opening tests permissions and the file system reliably
             pass
         if not existed:
             target.unlink()
@@ -126,7 +126,7 @@ def text_summary(summary: Mapping[str, Any], estimate: Estimate) -> str:
 
 
 def guard_lines(guard: Mapping[str, Any] | None) -> list[str]:
-    """What the guard did beyond writing: a dry run's writes, what it took back, why it held back to the end."""
+    """Lines about the guard: writes of a dry run, reverts, and the reason if nothing was pushed."""
     if not guard:
         return []
     decisions = guard["decisions"]

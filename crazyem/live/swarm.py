@@ -1,6 +1,6 @@
-"""Several drones in one process: the swarm file, the way from where each stands to where it flies, and their distances.
+"""Several drones in one process: the swarm file, the way from take-off to the trajectory, and distances between drones.
 
-A swarm file is TOML; what it leaves out is as on the command line:
+A swarm file is TOML; missing keys have the values of the command line:
 
     [[drone]]
     name = "alpha"                      # of the recording and in the summary; default: drone0, drone1, ...
@@ -27,12 +27,12 @@ from crazyem.toml_file import read_toml
 
 MOST_DRONES = 100  # drones
 LARGEST_SWARM_FILE = 1 << 18  # bytes
-# m between two drones: three times the width of a Crazyflie, and out of the worst of its downwash
+# m, least distance of two drones: three times the width of a Crazyflie, outside its strongest downwash
 CLOSEST_DISTANCE = 0.3
-LARGEST_OFFSET = 20.0  # m of an offset
-TRANSIT_SPEED = 0.5  # m/s, mean, on the way to an offset
-DISTANCE_STEP, MOST_DISTANCE_STEPS = 0.1, 2000  # s between looks at distances along trajectories, and how many at most
-SWITCH_INTERVAL = 0.0005  # s; the interpreter's 5 ms would be an eighth of an update's budget at every hand-over
+LARGEST_OFFSET = 20.0  # m, largest component of an offset
+TRANSIT_SPEED = 0.5  # m/s, mean speed on the way to an offset
+DISTANCE_STEP, MOST_DISTANCE_STEPS = 0.1, 2000  # s between checks of distances along trajectories; most checks
+SWITCH_INTERVAL = 0.0005  # s; the interpreter's 5 ms would be an eighth of an update's budget at every switch
 _DRONE_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
 _DRONE_KEYS = ("name", "uri", "vehicle", "trajectory", "offset")
 
@@ -41,7 +41,7 @@ Maker = Callable[[Vector, float], Trajectory]
 
 @dataclass(frozen=True)
 class Member:
-    """One drone of a swarm: where it is reached, what it is and flies. offset: m, world; trajectory: words."""
+    """One drone of a swarm: link, vehicle and trajectory. trajectory: words of the command line; offset: m, world."""
 
     name: str
     uri: str
@@ -52,7 +52,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Course:
-    """Where a drone stands, where its trajectory begins [m, world], and all it flies once it hovers."""
+    """Take-off place, begin of the trajectory [m, world], and the whole path of a drone after its hover."""
 
     stand: Vector
     begin: Vector
@@ -60,12 +60,12 @@ class Course:
 
 
 def shorten_switch_interval() -> None:
-    """Let threads hand over the interpreter ten times as often as usual: many of them wait for each other here."""
+    """Let threads switch ten times as often as by default, because many of them wait for each other."""
     sys.setswitchinterval(SWITCH_INTERVAL)
 
 
 def members_of(uris: Sequence[str], *, vehicle: str, trajectory: Sequence[str]) -> list[Member]:
-    """Drones named on the command line. Raises UsageError: too many, or one twice."""
+    """Drones of the command line. Raises UsageError: too many, or one twice."""
     if len(uris) > MOST_DRONES:
         raise UsageError(f"at most {MOST_DRONES} drones can be flown or watched at once, not {len(uris)}.")
     double = next((u for i, u in enumerate(uris) if u in uris[:i]), None)
@@ -78,9 +78,9 @@ def read_swarm(path: str | Path, *, vehicle: str, trajectory: Sequence[str]) -> 
     """The drones of a swarm file.
 
     Args:
-        vehicle, trajectory: of drones that do not say.
+        vehicle, trajectory: defaults for drones without these keys.
 
-    Raises: FileFormatError: not a swarm file; names the drone and the key. UsageError: no such file.
+    Raises: FileFormatError: not a swarm file; the message names the drone and the key. UsageError: no such file.
     """
     table = read_toml(path, what="swarm file", largest=LARGEST_SWARM_FILE)
     entries = table.pop("drone", None)
@@ -144,7 +144,7 @@ def _vector(value: Any, where: str) -> Vector:
 
 
 def with_offset(make: Maker, offset: Vector) -> Maker:
-    """Trajectories that begin `offset` [m, world] away: the way there first, at rest at both of its ends."""
+    """Trajectories that begin `offset` [m, world] away, after a transit that starts and ends at rest."""
     distance = math.hypot(*offset)
     if distance == 0.0:
         return make
@@ -170,16 +170,16 @@ def with_offset(make: Maker, offset: Vector) -> Maker:
 
 
 def check_distances(courses: Mapping[str, Course]) -> None:
-    """Refuse drones that would come too close. All are taken to begin together, as far as that is known before.
+    """Refuse drones that would come too close, under the assumption that all trajectories begin at the same time.
 
     Raises:
-        UsageError: two stand, begin, or fly at the same time, closer than `CLOSEST_DISTANCE`; the sentence
-            names them, the distance and when.
+        UsageError: two drones stand, begin or fly closer than `CLOSEST_DISTANCE`; the sentence names them, the
+            distance and the time.
     """
     for a, b in itertools.combinations(courses, 2):
         for what in ("stand", "begin"):
             distance = math.dist(getattr(courses[a], what), getattr(courses[b], what))
-            if not distance >= CLOSEST_DISTANCE:  # also where a position is not known
+            if not distance >= CLOSEST_DISTANCE:  # also true for NaN, an unknown position
                 raise UsageError(
                     f"{a} and {b} {what} {distance:.2f} m apart, less than {CLOSEST_DISTANCE:g} m: not flown."
                 )

@@ -1,4 +1,4 @@
-"""The newest state of the drone, for sequencing a flight (never for estimating: that is the pipeline's)."""
+"""The newest state of the drone, for the sequence of a flight (the pipeline estimates, not this module)."""
 
 import math
 from dataclasses import dataclass, field
@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from crazyem.estimation.contact import CONTACT_HEIGHT, ContactGate
 from crazyem.signals.sample import Sample
 
-# s: telemetry is late, and so is what is sent; a drone that at its present descent is down by then is landing
+# s; a drone that reaches the ground within this time at its present descent is landing. Covers the delays of telemetry
+# and of writes.
 LANDING_SECONDS = 0.3
 
 # supervisor.info, firmware supervisor.c
@@ -15,14 +16,14 @@ CAN_ARM, ARMED, AUTO_ARM, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << i fo
 
 @dataclass
 class Telemetry:
-    """Written by the receiving thread only, read by anyone.
+    """Newest values of telemetry; only the receiving thread writes them, all threads may read them.
 
     Attributes:
-        info: bits of supervisor.info, None until seen.
-        heard: s since the epoch, host time at which the newest `info` arrived; -inf before any, and once the
+        info: bits of supervisor.info, None before the first.
+        heard: s since the epoch, host time of the arrival of the newest `info`; -inf before the first, and after the
             link is lost.
         position: m, world. yaw: rad. voltage: V. setpoint: m, world.
-        climb: m/s, vertical velocity in the world; 0 where none is logged.
+        climb: m/s, vertical velocity in the world; 0 if none is logged.
     """
 
     info: int | None = None
@@ -32,11 +33,11 @@ class Telemetry:
     climb: float = 0.0
     voltage: float = math.nan
     setpoint: tuple[float, float, float] | None = None
-    _duty: float = math.inf  # of the fastest rotor, 0..1; inf where nothing is known
+    _duty: float = math.inf  # of the fastest rotor, 0..1; inf if unknown
     _contact: ContactGate = field(default_factory=lambda: ContactGate(math.inf))
 
     def take(self, sample: Sample) -> None:
-        """Keep what this sample says."""
+        """Store the value of a sample."""
         v = sample.value
         if sample.signal == "position":
             self.position = (v[0], v[1], v[2])
@@ -57,22 +58,25 @@ class Telemetry:
     def _look(self, height: float) -> None:
         flying = self.has(FLYING)
         if flying and self._duty <= 0.0:
-            height = math.nan  # rotors that stop in a fall are no sign that the drone rests at this height
+            height = math.nan  # rotors that stop in a fall do not show that the drone rests at this height
         self._contact.update(height=height, thrust=self._duty, flying=flying)
 
     @property
     def airborne(self) -> bool:
-        """Whether the drone is in the air: the firmware says that it flies (and goes on to say so for 2 s after its
-        motors stopped), its rotors turn, and it is not down where it stood before, by the estimator's own rule."""
+        """Whether the drone is in the air: the firmware says that it flies, and the estimator's contact rule agrees.
+
+        The firmware says so for 2 s after its motors stop. By the contact rule, the rotors turn and the drone is not at
+        its last resting height.
+        """
         return self.has(FLYING) and self._contact.airborne
 
     @property
     def landing(self) -> bool:
-        """Whether it is down within `LANDING_SECONDS` at its present descent; False where its floor is unknown."""
+        """Whether the drone is down within `LANDING_SECONDS` at its present descent; False if the floor is unknown."""
         return self.height - self._contact.rest_height + min(self.climb, 0.0) * LANDING_SECONDS < CONTACT_HEIGHT
 
     def has(self, bit: int) -> bool:
-        """Whether a bit of supervisor.info is set (False until it was seen)."""
+        """Whether a bit of supervisor.info is set (False before the first)."""
         return bool((self.info or 0) & bit)
 
     @property
@@ -81,7 +85,7 @@ class Telemetry:
         return self.position[2] if self.position else math.nan
 
     def grounded_reason(self) -> str:
-        """Why this drone cannot fly, in words; empty if nothing speaks against it."""
+        """Why this drone cannot fly, in words; empty if no reason is known."""
         if self.has(LOCKED):
             return "it is locked until it is restarted (an emergency stop or a setpoint timeout in flight)"
         if self.has(CRASHED):

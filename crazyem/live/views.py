@@ -1,4 +1,4 @@
-"""What a person sees of a running drone, as frozen values taken from a session, and what a person may do to it."""
+"""Views of a running session as frozen values, and the actions of a user on it."""
 
 import math
 import time
@@ -10,9 +10,9 @@ from crazyem.live.scheduler import UpdateThrottle
 from crazyem.live.session import Session
 
 TREND_SECONDS = 60.0  # s of estimates in a trend
-TREND_POINTS = 24  # of a trend
+TREND_POINTS = 24  # points of a trend
 NOT_PUSHED = "no guard: nothing is written"
-USER_MARK = "user_"  # of marks by the user, a number after it
+USER_MARK = "user_"  # name of marks by the user, followed by a number
 
 # parameter -> label, unit, factor
 SHOWN_PARAMETERS = (
@@ -26,7 +26,7 @@ SHOWN_PARAMETERS = (
 
 @dataclass(frozen=True, slots=True)
 class ParameterView:
-    """One parameter, in the unit shown; low and high are its 95 % interval, trend its values over the last minute."""
+    """One parameter in its displayed unit; low, high: 95 % interval; trend: values over the last minute."""
 
     label: str
     unit: str
@@ -40,7 +40,7 @@ class ParameterView:
 
 @dataclass(frozen=True, slots=True)
 class LinkView:
-    """Packets a second, share lost over the last second, totals, median echo [s], delay of the newest packets [s]."""
+    """Packets per second, share lost over the last second, totals, median round trip [s], largest median delay [s]."""
 
     rate: float = math.nan
     loss: float = math.nan
@@ -58,12 +58,12 @@ class Snapshot:
 
     Attributes:
         name: of the drone. uri: of its link.
-        phase: of the flight; seconds: in it. ended: why it is over, "" while it is not.
+        phase: of the flight; seconds: in this phase. ended: why the flight is over, "" before its end.
         parameters: newest estimate, empty before the first.
-        guard: mode; decision: why nothing is written now, or what was; paused: by the user; stopped: for good.
-        pushes: newest last: time [s], parameter, value, verified, purpose.
-        alarms: what needs a look, most urgent first.
-        voltage: V. height: m. behind: s the estimator is late. skipped: updates it left out. marks: by the user.
+        guard: its mode; decision: the last writes, or why there are none; paused: by the user; stopped: why, for good.
+        pushes: time [s], parameter, value, verified, purpose; the newest is last.
+        alarms: problems, the most urgent first.
+        voltage: V. height: m. behind: s, delay of the estimator. skipped: its skipped updates. marks: by the user.
     """
 
     name: str
@@ -97,7 +97,7 @@ class Observer:
         session: running, or not yet started.
         name: of the drone.
         phase: phase of the flight and seconds in it.
-        ended: why the flight is over, "" while it is not.
+        ended: why the flight is over, "" before its end.
     """
 
     def __init__(
@@ -154,7 +154,7 @@ class Observer:
         if not count or not estimates[count - 1].parameters:
             return ()
         newest = estimates[count - 1]
-        # Evenly over the minute; the list only grows, so what is read here stays.
+        # Evenly over the minute; the list only grows (thinning makes a new list), so these indices stay valid.
         span = min(count, round(TREND_SECONDS * 25))
         first = count - span
         chosen = sorted({first + (span - 1) * i // max(TREND_POINTS - 1, 1) for i in range(TREND_POINTS)})
@@ -173,7 +173,7 @@ class Observer:
         return tuple(views)
 
     def _link_view(self) -> LinkView:
-        """Renewed once a second: counting takes the link some time."""
+        """Statistics of the link, computed once a second because counting takes time."""
         now = time.monotonic()
         if self._counted is not None and now - self._counted[0] < 1.0:
             return self._link
@@ -209,11 +209,11 @@ class Observer:
 
 
 class SessionControls:
-    """Of one drone; every method returns at once, with one sentence on what is done. Called from one thread.
+    """Actions on one drone; every method returns at once with one sentence about its effect. Called from one thread.
 
     Args:
         session: running.
-        land: makes its flight land; None where the flight is somebody else's.
+        land: makes the flight land; None if another program flies the drone.
         name: of the drone, for the sentences.
     """
 
@@ -222,7 +222,7 @@ class SessionControls:
         self._land = land
 
     def toggle_push(self) -> str:
-        """Nothing new is written from now on, or again; what was written is still watched."""
+        """Switch pushing off or on; earlier writes are still judged."""
         pipeline = self.session.pipeline
         if self.session.write_supervisor is None:
             return f"{self.name}: nothing is pushed in this session."
@@ -238,7 +238,7 @@ class SessionControls:
         return f"{self.name}: {self.session.write_supervisor.revert_on_request()}"
 
     def mark(self) -> str:
-        """An event in the recording, and a mark in the summary."""
+        """Add an event to the recording and a mark to the summary."""
         time, marks = self.session.clock.newest, self.session.history.marks
         if not math.isfinite(time):
             return f"{self.name}: nothing was received yet."
@@ -249,7 +249,7 @@ class SessionControls:
         return f"{self.name}: mark {number} at {time:.2f} s{where}."
 
     def land(self) -> str:
-        """Land this drone, as a first Ctrl-C would all of them."""
+        """Land this drone only (a first Ctrl-C lands all of them)."""
         if self._land is None:
             return f"{self.name}: somebody else flies it."
         self._land()

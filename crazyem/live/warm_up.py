@@ -1,4 +1,4 @@
-"""Compiling before anything flies: a first compilation holds Python for seconds, the setpoint stream included."""
+"""Compilation before a flight: a compilation in flight would stop all Python threads, also setpoints, for seconds."""
 
 import math
 import time
@@ -14,7 +14,7 @@ from crazyem.vehicle import Vehicle
 
 
 def warm_up(vehicle: Vehicle) -> float:
-    """Run every kernel once; returns the seconds it took if any was compiled, 0.0 if all came from the disk."""
+    """Run every kernel once; returns the seconds if any kernel was compiled, 0.0 if all came from the disk."""
     begun, before = time.monotonic(), compilations()
     estimator = OnlineEstimator(vehicle, window=100, every=4, prediction_period=PERIOD)
     FlightMonitor(vehicle, FaultRules()).watch(estimator)
@@ -36,5 +36,5 @@ def warm_up(vehicle: Vehicle) -> float:
                 estimator.feed(Sample(name, t, value))
         estimator.finish()
     except CrazyemError:
-        pass  # nonsense data may be refused; compiling was the point
+        pass  # these artificial data may be refused; only the compilation matters
     return time.monotonic() - begun if compilations() > before else 0.0

@@ -1,7 +1,6 @@
-"""Whether the state of the drone lets a write pass: the newest telemetry, supervisor, battery and attitude decide.
+"""The last check before each write: telemetry, supervisor, battery and attitude of the drone must allow it.
 
-Everything else may be late: an estimate, a decision, a queue. So each single write passes here just before it is sent,
-or it is not sent.
+Estimates, decisions and queues may be late. So every single write is checked immediately before it is sent.
 """
 
 import math
@@ -13,22 +12,22 @@ from crazyem.live.policy import HealthLimits
 from crazyem.live.telemetry import CRASHED, FLYING, LOCKED, TUMBLED, Telemetry
 from crazyem.signals.sample import Sample
 
-# s on the drone's clock: what was heard longer ago says nothing about where the drone is now
+# s on the drone's clock; older telemetry does not show the present state
 FRESH_TELEMETRY_SECONDS = 0.3
-VOLTAGE_AVERAGE_SECONDS = 1.0  # s over which the voltage is averaged: a rotor that speeds up pulls it down for a moment
-VOLTAGE_HYSTERESIS = 0.05  # V over the threshold before writes are allowed again
+VOLTAGE_AVERAGE_SECONDS = 1.0  # s, averaging time of the voltage: an accelerating rotor lowers it for a moment
+VOLTAGE_HYSTERESIS = 0.05  # V above the threshold at which writes are allowed again
 FAULT_STATES = {TUMBLED: "has tumbled", LOCKED: "is locked", CRASHED: "has crashed"}
 
 
 class WriteGate:
-    """Says why nothing may be pushed now, and of one write, just before it is sent, why it must not be.
+    """Gives the reason why nothing may be pushed now, or why a single write must not be sent.
 
-    A push, its undoing and a revert belong into the air. Values are put back after a flight (`restore`) on the ground.
+    A push, its undo and a revert are allowed in the air only; a `restore` after a flight is allowed on the ground only.
 
     Args:
         telemetry: written by the receiving thread.
         limits: see `HealthLimits`.
-        rate: seconds of the drone's clock in one of the host's (a simulator may run fast).
+        rate: seconds of the drone's clock per second of the host's (a simulator may run fast).
         now: host time, s since the epoch, as in `Packet.host_time`.
     """
 
@@ -42,20 +41,20 @@ class WriteGate:
     ) -> None:
         self.telemetry, self.rate, self.now = telemetry, rate, now
         self.limits = limits or HealthLimits()
-        self.motors_cut = False  # by this program: telemetry says so up to 0.3 s later
+        self.motors_cut = False  # by this program; telemetry shows it up to 0.3 s later
         self._voltages: deque[tuple[float, float]] = deque(maxlen=2000)
         self._tilt = math.nan
         self._low = False
 
     def stale(self) -> str:
-        """Why telemetry says nothing about the present, one clause; "" while it is fresh."""
+        """Why telemetry is not fresh, one clause; "" if it is."""
         if self.telemetry.heard == -math.inf:
             return "no telemetry comes"
-        age = abs(self.now() - self.telemetry.heard) * self.rate()  # abs: somebody may set the host's clock
+        age = abs(self.now() - self.telemetry.heard) * self.rate()  # abs: the host's clock may be set
         return "" if age <= FRESH_TELEMETRY_SECONDS else f"the newest telemetry is {age:.1f} s old"
 
     def misplaced(self, purpose: str) -> str:
-        """Why a write for this purpose (`Push.purpose`) does not belong where the drone is, one clause; else ""."""
+        """Why the place of the drone forbids a write for this purpose (`Push.purpose`), one clause; or ""."""
         if purpose == "restore":
             return "the drone still flies" if self.telemetry.has(FLYING) else ""
         if self.motors_cut:
@@ -65,7 +64,7 @@ class WriteGate:
         return "the drone is about to land" if self.telemetry.landing else ""
 
     def objection(self, purpose: str) -> str:
-        """Why a write must not be sent now, one clause; "" if it may."""
+        """Why a write must not be sent now, one clause; "" if it is allowed."""
         return self.stale() or self.misplaced(purpose)
 
     def take(self, sample: Sample) -> None:
@@ -80,15 +79,15 @@ class WriteGate:
 
     @property
     def voltage(self) -> float:
-        """V, mean of the last second; NaN before any."""
+        """V, mean of the last second; NaN before the first."""
         kept = tuple(self._voltages)  # a copy: another thread adds to it
         return sum(v for _, v in kept) / len(kept) if kept else math.nan
 
     def health_objection(self, *, age: float) -> str:
-        """Why the state of the drone forbids every push now, one clause; "" if nothing does.
+        """Why the state of the drone forbids all pushes now, one clause; "" if it allows them.
 
         Args:
-            age: s by which the newest estimate is behind the drone's clock.
+            age: s, age of the newest estimate on the drone's clock.
         """
         return self._supervisor() or self._battery() or self._motion(age)
 

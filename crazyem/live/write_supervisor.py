@@ -1,7 +1,7 @@
-"""All that stands between estimates and a flying drone: guard, health, confirmation, watch, and the account of them.
+"""Supervision of writes to a flying drone: guard, health, confirmation, judgement after a write, and their account.
 
-The pipeline asks `consider` after every estimate. What it answers is written by the pusher; a dry run only tells.
-The watch after a write runs with the packets, not with the estimates: an estimator that stalls cannot blind it.
+The pipeline calls `consider` after every estimate, and the pusher writes the decision; a dry run only records it. The
+judgement after a write runs with the packets, not with the estimates, so a stalled estimator does not stop it.
 """
 
 import math
@@ -23,14 +23,15 @@ from crazyem.live.push import Pusher
 from crazyem.live.write_gate import WriteGate
 from crazyem.signals.sample import Sample
 
-# s: INDI flies as fast as a place is ahead, times posCtrlIndi.K_xi, and turns as its error in speed, times K_dxi, says.
+# s. INDI commands a speed (position error times posCtrlIndi.K_xi) and an acceleration (speed error times K_dxi). So it
+# follows positions that are ahead of the drone.
 INDI_PLACE_LEAD, INDI_LEAD = 1.0, 0.4
-# s, 6 Hz: with a loop gain that is too high INDI trembles with 7 to 12 Hz, an excitation has 1 to 4 Hz.
+# s, 6 Hz: with too high a loop gain INDI oscillates with 7 to 12 Hz; an excitation has 1 to 4 Hz.
 INDI_HIGH_PASS = 0.027
-MONITOR_PERIOD = 0.04  # s between looks of the watch
-GROUNDED_WITHIN = 3.0  # s; the firmware says that it flies for 2 s after its motors stopped
-HOLD_NOTE_PERIOD = 1.0  # s between notes on why nothing is written; only when the reason is another one
-MOST_ACCOUNT_ENTRIES = 5000  # in the account: bounded, however long the flight
+MONITOR_PERIOD = 0.04  # s between judgements
+GROUNDED_WITHIN = 3.0  # s, longest wait for the ground: the firmware reports a flight for 2 s after the motors stop
+HOLD_NOTE_PERIOD = 1.0  # s, shortest time between two notes about the reason why nothing is written
+MOST_ACCOUNT_ENTRIES = 5000  # most entries of the account: bounds the memory
 
 Confirm = Callable[[str, threading.Event], bool]
 
@@ -41,9 +42,9 @@ class WriteRules:
 
     Attributes:
         policy: see `Policy`.
-        dry_run: decide and tell, but write nothing.
-        ask: asked once, in a thread of its own, before the first write: takes the question and an event that is set
-            when nobody waits for the answer any more; True lets pushing begin. None: nobody is asked.
+        dry_run: make and record decisions, but write nothing.
+        confirm: called once, in its own thread, before the first write, with the question and an event that is set when
+            the answer is no longer needed; True allows pushes. None: no confirmation.
     """
 
     policy: Policy = field(default_factory=Policy)
@@ -52,24 +53,24 @@ class WriteRules:
 
     @property
     def mode(self) -> str:
-        """For the summary."""
+        """Text for the summary."""
         return "dry run" if self.dry_run else "push after confirmation" if self.confirm else "push"
 
 
 class WriteSupervisor:
-    """See the module. `take` is called from the receiving thread, `consider` from the estimating one.
+    """Supervisor of writes, see the module. The receiving thread calls `take`, the estimating thread `consider`.
 
     Args:
         guard: decides by the estimates.
-        rules: how.
+        rules: policy, dry run, confirmation.
         originals: parameter values at connect.
         history: gets notices and the account.
-        gate: what every write has to pass when it is sent; asked here first, so that nothing is decided in vain.
+        gate: check of every write before it is sent; also used here, to avoid decisions that it would refuse.
         now: newest time on the drone's clock, s.
         residual: time [s], innovations and their standard deviations of the newest sample, or None.
-        enabled: whether a time [s] is in a phase of the flight in which parameters are pushed.
-        fault: why the model of the flight does not hold at a time [s], "" where it does.
-        tell: takes a line for the recording.
+        enabled: whether a time [s] is in a phase of the flight with pushes.
+        fault: why the model of the flight does not hold at a time [s], "" if it holds.
+        record: takes a line for the recording.
     """
 
     def __init__(
@@ -119,7 +120,7 @@ class WriteSupervisor:
         record(f"guard: {rules.mode}, policy {rules.policy.name}")
 
     def take(self, samples: Sequence[Sample]) -> None:
-        """Samples of the flight as they arrive; takes back what made it worse."""
+        """Process samples as they arrive; reverts writes that made the flight worse."""
         for sample in samples:
             self.gate.take(sample)
             self.watch.take(sample)
@@ -133,7 +134,7 @@ class WriteSupervisor:
                 self._judge(newest)
 
     def consider(self, estimate: Estimate, time: float, *, airborne: bool, enabled: bool = True) -> Decision:
-        """What to write after this estimate; see `Guard.consider`."""
+        """The decision after an estimate; see `Guard.consider`."""
         self._innovations()
         self._airborne = airborne
         with self._lock:
@@ -156,12 +157,12 @@ class WriteSupervisor:
         return decision
 
     def on_mass_step(self, step: Step, time: float) -> None:
-        """A change of mass was noticed, or it was decided what it was, at `time` [s] (the estimating thread)."""
+        """A change of mass was detected, or its cause is now known, at `time` [s] (in the estimating thread)."""
         self.guard.on_mass_step(step)
         self.watch.on_mass_step(began=step.time, now=time, real=step.real)
 
     def on_written(self, decision: Decision, why: str) -> None:
-        """The pusher is through with a decision (its thread); `why` not all of it is in the drone, "" if it is."""
+        """The pusher has finished a decision (in its thread); `why` it is not complete in the drone, "" if it is."""
         if decision.kind == "push" and not why:
             self.watch.on_write(decision.time, max(self.now(), decision.time))
         self._owed = bool(why) if decision.kind == "revert" else self._owed
@@ -169,9 +170,9 @@ class WriteSupervisor:
         self._enter("not written" if why else "written", self.now(), reason=reason)
 
     def revert_on_request(self) -> str:
-        """A person wants the last good values back: those at connect, where the last good ones are in the drone.
+        """Revert to the last good values for the user; if the drone has these, to the values at connect.
 
-        Nothing more is pushed in this flight. Returns one sentence on what is done.
+        Nothing more is pushed in this flight. Returns one sentence about the effect.
         """
         if self.pusher is None or not self.history.pushes:
             return "nothing was written to this drone: there is nothing to take back."
@@ -183,19 +184,19 @@ class WriteSupervisor:
         return self._revert(self.now(), "asked for by the user", asked=True)
 
     def stop(self, *, motors_cut: bool = False) -> None:
-        """No new set is written from now on: the first step of every way out, before anything else ends.
+        """Write no new set from now on; this is the first step of every end of a flight.
 
-        motors_cut: nor is a set completed, whatever telemetry still says of the drone.
+        motors_cut: do not complete a set either, even if telemetry still shows a flight.
         """
         self.gate.motors_cut |= motors_cut
         self._ended.set()
         if self._stopped is None:
-            self._stopped = self.guard.stopped  # the end of the flight is no reason worth telling
+            self._stopped = self.guard.stopped  # the end of the flight itself is not reported as a reason
         self.guard.stop("the flight is over")
         self._reported_stop = self.guard.stopped
 
     def on_restart(self) -> None:
-        """The firmware has started anew: what was written is gone with it, unless such parameters are kept."""
+        """The firmware has restarted: written values are lost, unless the controller's parameters are persistent."""
         if self.pusher is None or not self.history.pushes or self.guard.controller.persistent:
             return
         self._restarted = True
@@ -203,9 +204,9 @@ class WriteSupervisor:
         self._say("the firmware was restarted and holds the values of its start again, nothing of what was written.")
 
     def end(self, outcome: str) -> None:
-        """The flight is over: keep what was written or put it back, as the policy says for this outcome.
+        """The flight is over: keep the written values or restore old ones, by the policy for this outcome.
 
-        A revert that the gate did not let pass is made up for here: what made the flight worse is not kept.
+        A revert that the gate refused in flight is done here: values that made the flight worse are not kept.
 
         Args:
             outcome: landed, interrupted, failed or link_lost.
@@ -218,7 +219,7 @@ class WriteSupervisor:
         if rule == "keep":
             return
         target = self.good if rule == "good" else self.originals
-        # What is still in flight is finished before this; whatever is right by then is not written again.
+        # The pusher finishes earlier decisions first, and does not write values again that are right by then.
         values = "the values at connect" if rule == "restore" else "the last values judged good"
         until = time.monotonic() + GROUNDED_WITHIN
         while not self.gate.stale() and self.gate.misplaced("restore") and time.monotonic() < until:
@@ -230,7 +231,7 @@ class WriteSupervisor:
         self.pusher.submit(Decision(self.now(), writes=tuple(target.items()), reason=rule, kind="restore"))
 
     def close(self) -> None:
-        """After the pusher has ended: completes the account, and says whether a restore succeeded."""
+        """After the end of the pusher: complete the account, and report whether a restore succeeded."""
         self._ended.set()
         account = self.history.guard
         account["stopped"] = self.guard.stopped if self._stopped is None else self._stopped
@@ -294,8 +295,8 @@ class WriteSupervisor:
         self.history.notice(sentence)
         self._enter("revert", time, writes=back, reason=why)
         self.watch.forget()
-        # All of the good values: a set that is submitted in this moment is taken back with the rest.
-        kind = "restore" if asked and not self.gate.telemetry.airborne else "revert"  # a person may ask on the ground
+        # All good values, so that a set submitted at this moment is reverted as well.
+        kind = "restore" if asked and not self.gate.telemetry.airborne else "revert"  # the user may ask on the ground
         self.pusher.submit(Decision(time, writes=tuple(self.good.items()), reason=sentence, kind=kind))
         return sentence
 
@@ -311,7 +312,7 @@ class WriteSupervisor:
         assert self.rules.confirm is not None
         try:
             agreed = self.rules.confirm(question, self._ended)
-        except Exception as error:  # nobody could be asked: that is no agreement
+        except Exception as error:  # an error is no agreement
             agreed = False
             self.history.notice(f"the confirmation of the first write could not be asked for: {error!r}.")
         if self._ended.is_set():
@@ -334,7 +335,7 @@ class WriteSupervisor:
         self.record(f"guard: {sentence}")
 
     def _enter(self, action: str, time: float, *, writes: tuple[tuple[str, float], ...] = (), reason: str = "") -> None:
-        """Into the account and the recording."""
+        """Add an entry to the account and to the recording."""
         entry: dict[str, Any] = {"time": time, "action": action, "reason": reason}
         if writes:
             entry["writes"] = [list(w) for w in writes]
