@@ -1,13 +1,13 @@
-"""What the firmware's controllers take: INDI's and Mellinger's parameters in command units, and INDI's setpoints.
+"""Command units of the firmware's controllers: parameters of INDI and Mellinger, and setpoints for INDI.
 
 PID, Mellinger and INDI command in units of the firmware's legacy mixer (powerDistributionLegacy in
-power_distribution_quadrotor.c): a unit of thrust or yaw is one of every rotor, two units of roll or pitch are. 65535
-units are the firmware's THRUST_MAX where it compensates the battery voltage (motors.c, motorsCompensateBatteryVoltage),
-else full duty.
+power_distribution_quadrotor.c). One unit of thrust or yaw changes every rotor by one unit; one unit of roll or pitch
+changes every rotor by half a unit. 65535 units are the firmware's THRUST_MAX if it compensates the battery voltage
+(motors.c, motorsCompensateBatteryVoltage), else full duty.
 
-Of a setpoint with a place INDI takes place and heading only. Its outer loop (position_controller_indi.c) wants the
-acceleration K_dxi (K_xi (place - p) - v), and its inner one the yaw rate ref_err_r (heading - yaw). A place ahead of
-the reference by (v + a/K_dxi)/K_xi asks for the reference's acceleration where the drone is on it; a heading ahead by
+INDI uses only position and heading of a position setpoint. Its outer loop (position_controller_indi.c) commands the
+acceleration K_dxi (K_xi (setpoint - p) - v), its inner loop the yaw rate ref_err_r (heading - yaw). A setpoint ahead of
+the reference by (v + a/K_dxi)/K_xi gives the reference's acceleration for a drone on the reference. A heading ahead by
 its rate over ref_err_r does the same for yaw.
 """
 
@@ -21,14 +21,14 @@ from crazyem.vehicle import GRAVITY, Vehicle
 
 FULL = 65535.0  # units
 LOOP = 0.002  # s, the period of INDI's loop: ATTITUDE_RATE 500 Hz in stabilizer_types.h
-BISECTIONS = 60  # of the voltage interval: to the last bit
+BISECTIONS = 60  # of the voltage interval, to the last bit
 
 
 def motor_volts(vehicle: Vehicle, thrust: float) -> float:
-    """Motor volts at which one rotor's thrust curve gives `thrust` [N], on the branch that rises (0 to 20 V).
+    """Motor voltage [V] at which one rotor's thrust curve gives `thrust` [N], on its rising branch (0 to 20 V).
 
     Raises:
-        ValueError: the curve does not reach that thrust.
+        ValueError: the curve does not reach this thrust.
     """
     low, high = _lowest(vehicle), 20.0
     if not _thrust(vehicle, low) <= thrust <= _thrust(vehicle, high):
@@ -44,7 +44,7 @@ def _thrust(vehicle: Vehicle, volts: float) -> float:
 
 
 def _lowest(vehicle: Vehicle) -> float:
-    """Volts from which the curve rises for good, in steps of 0.05 V."""
+    """Lowest voltage above which the curve only rises, in steps of 0.05 V."""
     steps = [0.05 * n for n in range(401)]
     falling = [v for v in steps if _slope(vehicle, v) <= 0.0]
     return max(falling, default=-0.05) + 0.05
@@ -55,12 +55,12 @@ def _slope(vehicle: Vehicle, volts: float) -> float:
 
 
 def thrust_per_unit(vehicle: Vehicle, *, thrust: float, volts: float) -> float:
-    """Change of one rotor's thrust with one unit of command [N], about `thrust` [N] at the battery's `volts` [V].
+    """Change of one rotor's thrust per unit of command [N], at `thrust` [N] and the battery voltage `volts` [V].
 
-    A firmware that compensates the voltage makes it THRUST_MAX/65535 at every voltage: the vehicle's thrust_max.
+    If the firmware compensates the voltage, this is THRUST_MAX/65535 at every voltage (the vehicle's thrust_max).
 
     Raises:
-        ValueError: the vehicle has no finite thrust_max (compensated), or no curve that reaches the thrust.
+        ValueError: the vehicle has no finite thrust_max (compensated), or its curve does not reach the thrust.
     """
     if vehicle.battery_compensated:
         if not math.isfinite(vehicle.thrust_max):
@@ -70,38 +70,38 @@ def thrust_per_unit(vehicle: Vehicle, *, thrust: float, volts: float) -> float:
 
 
 def unit_torque(vehicle: Vehicle, per_unit: float) -> tuple[float, float, float]:
-    """Torque about x, y, z of one unit of roll, pitch, yaw command [N m]: four rotors, half a unit each but in yaw."""
+    """Torque [N m] about x, y, z of one unit of roll, pitch, yaw: half a unit per rotor (roll, pitch), or one (yaw)."""
     along_x, along_y = vehicle.arm
     return 2.0 * along_y * per_unit, 2.0 * along_x * per_unit, 4.0 * vehicle.torque_per_thrust * per_unit
 
 
 def rotor_reaction(per_unit: float, *, thrust: float, rotor_constant: float, rotor_inertia: float, izz: float) -> float:
-    """ctrlINDI.g2 [rad/s^2 a unit]: what four rotors' inertia adds to the yaw acceleration in the step of a command.
+    """ctrlINDI.g2 [rad/s^2 per unit]: yaw acceleration from the inertia of four rotors at a step of the command.
 
     4 I_r (dW/df)(df/du) / (Izz T) with W = sqrt(f/k), T the loop's period: G2 of Smeur, Chu, de Croon 2016, eq. 12.
 
     Args:
-        per_unit: N. thrust: of one rotor in hover [N]. rotor_constant: k [N/(rad/s)^2]. rotor_inertia: I_r of a rotor
-            with propeller [kg m^2]. izz: kg m^2.
+        per_unit: thrust per unit [N]. thrust: of one rotor in hover [N]. rotor_constant: k [N/(rad/s)^2].
+        rotor_inertia: I_r of a rotor with propeller [kg m^2]. izz: kg m^2.
     """
     speed_per_thrust = 0.5 / math.sqrt(rotor_constant * thrust)  # dW/df = 1/(2 k W)
     return 4.0 * rotor_inertia * speed_per_thrust * per_unit / (izz * LOOP)
 
 
 def lag_share(time_constant: float) -> float:
-    """ctrlINDI.act_dyn_*: share of the way that rotors with this lag [s] go in a period of the loop; 1 without lag."""
+    """ctrlINDI.act_dyn_*: share of a step that rotors with this lag [s] follow in one loop period; 1 without lag."""
     return 1.0 - math.exp(-LOOP / time_constant) if time_constant > 0.0 else 1.0
 
 
 def lag_of(share: float) -> float:
-    """Inverse of `lag_share`: s; 0 for a share of 1 and more, infinite for none."""
+    """Time constant [s], inverse of `lag_share`: 0 for a share of 1 or more, infinite for 0 or less."""
     if share >= 1.0:
         return 0.0
     return -LOOP / math.log1p(-share) if share > 0.0 else math.inf
 
 
 def mass_thrust(vehicle: Vehicle, *, force: float, volts: float) -> float:
-    """ctrlMel.massThrust: units of thrust a newton of wanted force [1/N], exact at `force` [N] of the four rotors.
+    """ctrlMel.massThrust: units of thrust per newton of commanded force [1/N], exact at `force` [N] of four rotors.
 
     Raises:
         ValueError: as `thrust_per_unit`.
@@ -115,8 +115,8 @@ def effectiveness_torque(vehicle: Vehicle) -> tuple[float, float, float]:
     """Torque about x, y, z of one unit of command [N m], at every voltage: g1 times the inertia.
 
     Raises:
-        ValueError: the vehicle has no rotors or thrust_max, or its firmware does not compensate the battery voltage, so
-            that this would change with the voltage (`thrust_per_unit` and `unit_torque` have it at one voltage).
+        ValueError: the vehicle has no rotors or thrust_max, or its firmware does not compensate the battery voltage.
+            Then the torque depends on the voltage (see `thrust_per_unit` and `unit_torque`).
     """
     if not vehicle.battery_compensated:
         raise ValueError(f"commands of {vehicle.name} are not compensated for the battery voltage")
@@ -127,7 +127,7 @@ def effectiveness_torque(vehicle: Vehicle) -> tuple[float, float, float]:
 
 
 def rotor_reaction_factor(vehicle: Vehicle, rotor_inertia: float) -> float:
-    """g2 times Izz [N m a unit] in hover, for rotors of `rotor_inertia` [kg m^2]; see `rotor_reaction`."""
+    """g2 times Izz [N m per unit] in hover, for rotors of `rotor_inertia` [kg m^2]; see `rotor_reaction`."""
     constant = vehicle.rotor_constant or TYPICAL_ROTOR_CONSTANT
     per_unit = thrust_per_unit(vehicle, thrust=0.0, volts=0.0)
     thrust = vehicle.mass * GRAVITY / 4.0
@@ -139,7 +139,7 @@ _AXES = ("x", "y", "z")
 
 @dataclass(frozen=True)
 class IndiGains:
-    """The firmware's gains, 1/s: of places, of velocities, of the heading. Defaults: those at boot."""
+    """INDI's gains in the firmware, 1/s: of position, velocity and heading. Defaults: the values at boot."""
 
     place: tuple[float, float, float] = (1.0, 1.0, 1.0)
     velocity: tuple[float, float, float] = (5.0, 5.0, 5.0)
@@ -147,7 +147,7 @@ class IndiGains:
 
     @classmethod
     def of(cls, values: Mapping[str, float]) -> "IndiGains":
-        """From parameter values; see `PARAMETERS`. A gain that is not positive counts as the one at boot."""
+        """Gains from parameter values; see `PARAMETERS`. The boot value replaces a gain that is not positive."""
         plain = cls()
 
         def positive(name: str, otherwise: float) -> float:
@@ -169,7 +169,7 @@ PARAMETERS = (
 
 
 def place_ahead(r: Reference, gains: IndiGains) -> tuple[float, float, float, float]:
-    """x, y, z [m, world] and heading [rad] to send for a reference."""
+    """Setpoint x, y, z [m, world] and heading [rad] for INDI to follow a reference; see the module."""
     x, y, z = (
         p + (v + a / k_v) / k_p
         for p, v, a, k_p, k_v in zip(r.position, r.velocity, r.acceleration, gains.place, gains.velocity)

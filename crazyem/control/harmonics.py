@@ -1,4 +1,4 @@
-"""A manoeuvre as a sum of few harmonics on each axis under a smooth window: starts and ends in hover, all orders known.
+"""A manoeuvre as a sum of a few harmonics on each axis with a smooth window: it starts and ends in hover.
 
 Each of x, y, z and yaw is q(t) = w(t) sum_k (c_k cos 2 pi f_k t + s_k sin 2 pi f_k t), with the window w of
 `trajectories.window`: position, velocity, acceleration and jerk are zero at both ends.
@@ -26,11 +26,11 @@ class Axis:
 
 @dataclass(frozen=True)
 class Harmonics:
-    """A manoeuvre about the point where the drone hovers.
+    """A manoeuvre about the hover point.
 
     Attributes:
         duration: s.
-        ramp: s to reach full amplitude, and to come to rest again.
+        ramp: s to reach full amplitude, and to return to rest.
         axes: x, y, z, yaw.
     """
 
@@ -41,7 +41,7 @@ class Harmonics:
     def derivatives(self, time: NDArray[np.float64]) -> NDArray[np.float64]:
         """Displacement and its first three derivatives at `time` (n,) s: (4 orders, n, 4 axes), m and rad, SI.
 
-        Times outside [0, duration] give the ends, which are at rest.
+        Times outside [0, duration] give the state at the ends, which is at rest.
         """
         t = np.clip(np.asarray(time, float), 0.0, self.duration)
         weight = self._window(t)
@@ -52,7 +52,7 @@ class Harmonics:
             rate = 2.0 * math.pi * np.array(axis.frequency)
             c, s = np.cos(np.outer(t, rate)), np.sin(np.outer(t, rate))
             a, b = np.array(axis.cosine), np.array(axis.sine)
-            # d/dt (a cos + b sin) = rate (b cos - a sin): the pair (a, b) turns by a quarter each time
+            # d/dt (a cos + b sin) = rate (b cos - a sin)
             q = np.empty((4, t.size))
             for order in range(4):
                 q[order] = c @ a + s @ b
@@ -83,7 +83,7 @@ class Harmonics:
         return replace(self, axes=(axes[0], axes[1], axes[2], axes[3]))
 
     def trajectory(self, position: Vector, yaw: float, name: str = "plan") -> Trajectory:
-        """The manoeuvre about `position` [m, world] with heading `yaw` [rad]; its x and y are those of the heading."""
+        """The manoeuvre about `position` [m, world]; its x axis points along the heading `yaw` [rad]."""
         c, s = math.cos(yaw), math.sin(yaw)
 
         def at(t: float) -> Reference:

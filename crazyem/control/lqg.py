@@ -1,7 +1,7 @@
 """The controller of Zhao's paper: LQR gains on the filtered state, thrust and torque from the estimated parameters.
 
-By differential flatness an acceleration asks for an attitude (eq. 8-21; Faessler et al.). Euler angles are roll, pitch,
-yaw of R = Rz(yaw) Ry(pitch) Rx(roll), body (FLU) to world; see the errata for eq. 46.
+By differential flatness, an acceleration determines an attitude (eq. 8-21; Faessler et al.). Euler angles are roll,
+pitch, yaw of R = Rz(yaw) Ry(pitch) Rx(roll), body (FLU) to world; see the errata for eq. 46.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ def reference_angles(acceleration, yaw, angles):
 
     Args:
         acceleration: (3,) m/s^2, world, gravity excluded.
-        yaw: heading wanted [rad].
+        yaw: desired heading [rad].
         angles: (3,) receives the angles.
 
     Returns:
@@ -26,7 +26,7 @@ def reference_angles(acceleration, yaw, angles):
     t = np.empty(3)
     t[0], t[1], t[2] = acceleration[0], acceleration[1], acceleration[2] + GRAVITY
     norm = np.sqrt(t[0] ** 2 + t[1] ** 2 + t[2] ** 2)
-    if norm < 1e-9:  # free fall asks for no attitude
+    if norm < 1e-9:  # free fall determines no attitude
         angles[0], angles[1], angles[2] = 0.0, 0.0, yaw
         return norm
     z = t / norm
@@ -63,7 +63,7 @@ def reference_rate(angles, wanted, gain, rate):
     rate[2] = -sr * error[1] + cp * cr * error[2]
 
 
-# least cos(pitch) cos(roll) that thrust is divided by (eq. 83 has none: it grows without bound)
+# Lower bound of cos(pitch) cos(roll), the divisor of the thrust; without it (eq. 83) the thrust would be unlimited.
 SMALLEST_TILT_COSINE = 0.2
 
 
@@ -72,11 +72,11 @@ def position_gains(*, dt: float, position_weight: float, velocity_weight: float)
 
     Args:
         dt: s.
-        position_weight, velocity_weight: cost of 1 m and of 1 m/s, over that of 1 m/s^2 (the paper gives none).
+        position_weight, velocity_weight: cost of 1 m and of 1 m/s, over that of 1 m/s^2 (not given in the paper).
     """
     a = np.array([[1.0, dt], [0.0, 1.0]])
     b = np.array([[0.5 * dt * dt], [dt]])
-    from control import dlqr  # slow to import, and no flight designs gains
+    from control import dlqr  # a slow import, and not needed in flight
 
     gain, _, _ = dlqr(a, b, np.diag([position_weight, velocity_weight]), np.eye(1))
     return np.array([float(gain[0, 0]), float(gain[0, 1])])
@@ -89,7 +89,7 @@ def control(state, reference, yaw, gains, limit, mass, inertia, wrench):
     Args:
         state: (12,) position m, velocity m/s (world), roll pitch yaw rad, body rate rad/s.
         reference: (9,) position m, velocity m/s, acceleration m/s^2, world.
-        yaw: wanted [rad].
+        yaw: desired [rad].
         gains: (4,) position 1/s^2, velocity 1/s, angle K_theta 1/s, rate K_omega 1/s.
         limit: largest commanded acceleration [m/s^2].
         mass: kg, as the controller believes it.

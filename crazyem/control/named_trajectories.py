@@ -1,4 +1,4 @@
-"""Trajectories by the words that name them, on a command line, in a script or in a swarm file; and waypoint files.
+"""Trajectories by name, for the command line, scripts and swarm files; and waypoint files.
 
 A waypoint file (CSV or TOML) becomes a quintic spline through its points, at rest at both ends.
 """
@@ -29,7 +29,7 @@ def read_waypoints(path: str | Path) -> list[dict[str, float]]:
     point]. TOML: an array of tables `[[waypoints]]` with the same keys.
 
     Raises:
-        UsageError: no such file. FileFormatError: naming the file and the row or key.
+        UsageError: no such file. FileFormatError: the message names the file and the row or key.
     """
     path = Path(path)
     text = read_text(path, what="waypoint file")
@@ -72,14 +72,14 @@ def read_waypoints(path: str | Path) -> list[dict[str, float]]:
 
 
 def _times(points: NDArray[np.float64], rows: Sequence[dict[str, float]], path: str | Path) -> NDArray[np.float64]:
-    """Time at each of points (n, 3); the first is the start at 0, `rows` are the others."""
+    """Time [s] at each of points (n, 3); the first point is the start at 0, `rows` are the others."""
     times = [0.0]
     for i, row in enumerate(rows):
         distance = float(np.linalg.norm(points[i + 1] - points[i]))
         if "time" in row:
             times.append(row["time"])
         else:
-            # Start and end at rest need longer than the cruise speed suggests.
+            # Acceleration from rest and to rest takes additional time.
             rest = 1.0 if i in (0, len(rows) - 1) else 0.0
             times.append(times[-1] + max(distance / row.get("speed", DEFAULT_SPEED), 0.5) + rest)
     if not np.all(np.diff(times) > 0.05):
@@ -88,10 +88,10 @@ def _times(points: NDArray[np.float64], rows: Sequence[dict[str, float]], path: 
 
 
 def waypoints(*, path: str | Path, position: Vector, yaw: float = 0.0) -> Trajectory:
-    """A smooth path from `position` [m, world] and `yaw` [rad], where the drone hovers, through the points of a file.
+    """A smooth path from the hover at `position` [m, world] and `yaw` [rad] through the points of a file.
 
     Raises:
-        FileFormatError: a file that cannot be used, or a path that asks for more than `MAX_ACCELERATION`.
+        FileFormatError: the file cannot be used, or the path needs more than `MAX_ACCELERATION`.
     """
     rows = read_waypoints(path)
     points = np.array([position, *([r["x"], r["y"], r["z"]] for r in rows)])
@@ -131,8 +131,8 @@ def waypoints(*, path: str | Path, position: Vector, yaw: float = 0.0) -> Trajec
     return Trajectory(f"waypoints {Path(path).name}", duration, at)
 
 
-DEFAULT_HEIGHT = 1.0  # m above the take-off point, at which every named trajectory begins
-TrajectoryMaker = Callable[[Vector, float], Trajectory]  # from the position [m, world] and heading [rad] at its begin
+DEFAULT_HEIGHT = 1.0  # m above the take-off point, start of every named trajectory
+TrajectoryMaker = Callable[[Vector, float], Trajectory]  # arguments: position [m, world] and heading [rad] at the start
 
 
 def _made(name: str, position: Vector, yaw: float, duration: float) -> Trajectory:
@@ -144,20 +144,20 @@ def _made(name: str, position: Vector, yaw: float, duration: float) -> Trajector
 
 
 def trajectory_maker(words: Sequence[str], duration: float) -> TrajectoryMaker:
-    """From words such as ("figure8",) or ("waypoints", "FILE") to a maker of trajectories.
+    """The maker of a trajectory for words such as ("figure8",) or ("waypoints", "FILE").
 
     Args:
-        words: a name and what belongs to it.
+        words: a name and its arguments.
         duration: s; waypoints and plans have their own.
 
     Raises:
-        UsageError: an unknown name or a missing file name. FileFormatError: a file that cannot be used.
+        UsageError: an unknown name or a missing file name. FileFormatError: the file cannot be used.
     """
     name, *rest = words
     if name == "waypoints":
         if len(rest) != 1:
             raise UsageError("--trajectory waypoints needs one FILE.")
-        read_waypoints(rest[0])  # complain before anything is started
+        read_waypoints(rest[0])  # report errors before the start
         return lambda position, yaw: waypoints(path=rest[0], position=position, yaw=yaw)
     if name == "informative" and not rest:
         raise UsageError("--trajectory informative is planned in flight, for one drone at a time.")
@@ -175,7 +175,7 @@ def trajectory_maker(words: Sequence[str], duration: float) -> TrajectoryMaker:
 
 
 def duration_note(words: Sequence[str], duration: float) -> str:
-    """One line where the trajectory of these words takes another time than asked for, "" where it does not."""
+    """One line if the duration of the trajectory differs from the requested one, else ""."""
     made = (
         duration
         if words[0] in ("waypoints", "plan")

@@ -1,7 +1,7 @@
-"""Plan files (TOML): a manoeuvre of `harmonics` with the limits it keeps; checked again whenever one is read.
+"""Plan files (TOML): a manoeuvre of `harmonics` and its limits, checked at every reading.
 
-The format is in docs/reference/formats/plan.md. A file is data from anywhere: what it asks of a drone is computed from
-its numbers, whatever it says of itself, and must lie within its own limits and within those of this module.
+The format is in docs/reference/formats/plan.md. A file may come from any source. So its motion is computed from its
+numbers, and must be within the limits in the file and within those of this module.
 """
 
 from collections.abc import Mapping
@@ -20,20 +20,20 @@ from crazyem.vehicle import GRAVITY
 FORMAT, VERSION = "crazyem-plan", 1
 LONGEST = 300.0  # s; a Crazyflie's battery lasts less than ten minutes
 SHORTEST_RAMP = 0.2  # s
-MOST_LINES = 64  # of an axis
-LARGEST_NUMBER = 1e6  # of a file; no place, angle or frequency is
-HIGHEST_FREQUENCY = 10.0  # Hz; no attitude loop of these drones follows more
+MOST_LINES = 64  # harmonics of an axis
+LARGEST_NUMBER = 1e6  # in a file, above every possible position, angle or frequency
+HIGHEST_FREQUENCY = 10.0  # Hz; the attitude loops of these drones do not follow higher ones
 LARGEST_BOX = 20.0  # m
-LARGEST_TILT = 45.0  # deg; beyond, thrust for the height runs out
+LARGEST_TILT = 45.0  # deg; with more tilt, the thrust does not hold the height
 LARGEST_YAW_RATE, LARGEST_YAW_ACCELERATION = 6.5, 60.0  # rad/s, rad/s^2
 LEAST_HEIGHT = 0.1  # m, of the lowest point in the world frame, as for waypoints
-GRID = 0.005  # s between the points at which a plan is checked
-SLACK = 1.001  # for what was rounded in writing
+GRID = 0.005  # s between the checked points of a plan
+SLACK = 1.001  # factor on limits, for rounding errors in a file
 
 
 @dataclass(frozen=True)
 class PlanFile:
-    """manoeuvre; box (3,) m full widths; tilt deg; vehicle: for whom it was made."""
+    """A plan: manoeuvre; box (3,) full widths, m; tilt, deg; vehicle for which it was made."""
 
     manoeuvre: Harmonics
     box: tuple[float, float, float]
@@ -42,11 +42,10 @@ class PlanFile:
 
 
 def read_plan(path: str | Path) -> PlanFile:
-    """A plan that may be flown.
+    """A plan that may be flown, from a file.
 
     Raises:
-        UsageError: no such file. FileFormatError: one sentence that names the file and the key, or what the plan asks
-            too much of.
+        UsageError: no such file. FileFormatError: one sentence that names the file and the key, or the exceeded limit.
     """
     data = read_toml(path, what="plan file")
     where = f"plan file {path}"
@@ -68,10 +67,10 @@ def read_plan(path: str | Path) -> PlanFile:
 
 
 def plan_trajectory(plan: PlanFile, *, path: str | Path, position: Vector, yaw: float) -> Trajectory:
-    """The plan from where the drone hovers: `position` [m, world] and heading `yaw` [rad].
+    """The trajectory of a plan from the hover at `position` [m, world] with heading `yaw` [rad].
 
     Raises:
-        FileFormatError: the plan would touch the ground from there.
+        FileFormatError: the plan would touch the ground from this position.
     """
     manoeuvre = plan.manoeuvre
     time = np.arange(0.0, manoeuvre.duration + GRID, GRID)
@@ -82,7 +81,7 @@ def plan_trajectory(plan: PlanFile, *, path: str | Path, position: Vector, yaw: 
 
 
 def _check(plan: PlanFile, where: str) -> None:
-    """Refuse what no drone should fly, and what the plan's own limits forbid."""
+    """Check the plan against its own limits and those of this module. Raises FileFormatError."""
     time = np.arange(0.0, plan.manoeuvre.duration + GRID, GRID)
     place, speed, acceleration, _ = plan.manoeuvre.derivatives(time)
     far = np.abs(place[:, :3]).max(0)
@@ -137,7 +136,7 @@ def _numbers(data: Mapping[str, Any], key: str, where: str) -> tuple[float, ...]
 
 
 def plan_toml(plan: PlanFile, comments: tuple[str, ...] = ()) -> str:
-    """The text of a plan file; `comments` go to its head."""
+    """The text of a plan file, with `comments` at its beginning."""
     m = plan.manoeuvre
     lines = [*(f"# {c}" for c in comments), f'format = "{FORMAT}"', f"version = {VERSION}",
              f"vehicle = {_quoted(plan.vehicle)}", f"duration = {m.duration!r}  # s", f"ramp = {m.ramp!r}  # s",

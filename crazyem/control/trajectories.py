@@ -1,16 +1,16 @@
-"""Reference trajectories as pure functions of time: hover, figure 8, and the excitation that shows inertia."""
+"""Reference trajectories as pure functions of time: hover, figure 8, and the excitation for the inertia."""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 Vector = tuple[float, float, float]
-MAX_ACCELERATION = 8.0  # m/s^2; beyond this a Crazyflie runs out of thrust or of the setpoint's range
+MAX_ACCELERATION = 8.0  # m/s^2; above, the thrust of a Crazyflie or the range of the setpoint is not enough
 
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """What the drone should do at one instant, world frame (z up).
+    """The desired state of the drone at one instant, world frame (z up).
 
     Attributes:
         position: m. velocity: m/s. acceleration: m/s^2, gravity excluded. jerk: m/s^3.
@@ -26,7 +26,7 @@ class Reference:
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
-        """Desired heading as a quaternion x y z w, body to world; controllers take only the yaw from it."""
+        """Desired heading as a quaternion x y z w, body to world; controllers use only its yaw."""
         return 0.0, 0.0, math.sin(self.yaw / 2), math.cos(self.yaw / 2)
 
 
@@ -42,7 +42,7 @@ class Trajectory:
         name: for reports.
         duration: s; the reference is at rest at 0 and at `duration`.
         at: time since the start [s] -> Reference; times outside [0, duration] hold the end points.
-        finished: whether it is over before its duration; the reference is at rest then.
+        finished: whether the trajectory has ended before its duration; the reference is then at rest.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Trajectory:
 
 
 def smooth_step(x: float) -> tuple[float, float, float, float]:
-    """0 -> 1 over x in [0, 1] with three zero derivatives at both ends: value and first three derivatives by x."""
+    """A step from 0 to 1 over x in [0, 1]: value and first three derivatives by x, which are zero at both ends."""
     if x <= 0.0:
         return 0.0, 0.0, 0.0, 0.0
     if x >= 1.0:
@@ -66,7 +66,7 @@ def smooth_step(x: float) -> tuple[float, float, float, float]:
 
 
 def window(t: float, *, duration: float, ramp: float) -> tuple[float, float, float, float]:
-    """A weight that rises from 0 to 1 in `ramp` seconds, and falls to 0 again at `duration`; with three derivatives."""
+    """A weight that rises from 0 to 1 in `ramp` seconds and falls to 0 at `duration`, with three derivatives."""
     ramp = min(ramp, duration / 2)
     if t <= ramp:
         w, sign = smooth_step(t / ramp), 1.0
@@ -97,13 +97,13 @@ def figure8(
     period: float = 5.0,
     ramp: float = 2.0,
 ) -> Trajectory:
-    """A lemniscate x = sx sin p, y = sy sin 2p around `position` [m, world], in whole figures: it ends where it begins.
+    """A lemniscate x = sx sin p, y = sy sin 2p around `position` [m, world], in whole figures: it ends at its start.
 
     Args:
-        duration: s; the nearest whole number of figures is flown, at least one, so the trajectory's own may differ.
+        duration: s; rounded to a whole number of figures, at least one.
         size: half widths along x and y, m.
         period: s for one whole figure at full speed.
-        ramp: s to reach full speed, and to stop again; at most a period.
+        ramp: s to reach full speed, and to stop; at most a period.
     """
     rate = 2 * math.pi / period
     ramp = min(ramp, period)
@@ -111,7 +111,7 @@ def figure8(
     duration = figures * period + ramp  # the two ramps together cover one ramp's length of the figure
 
     def phase(t: float) -> tuple[float, float, float, float]:
-        # The speed along the figure is ramped, not its shape; the phase is the integral of the ramp.
+        # The speed along the figure is ramped, not the size; the phase is the integral of the ramp.
         t = min(max(t, 0.0), duration)
         w, dw, ddw, _ = window(t, duration=duration, ramp=ramp)
         if t <= ramp:
@@ -149,12 +149,12 @@ def _chain(f: float, f1: float, f2: float, f3: float, dp: float, ddp: float, ddd
     return f, f1 * dp, f2 * dp * dp + f1 * ddp, f3 * dp**3 + 3 * f2 * dp * ddp + f1 * dddp
 
 
-# Lines of the excitation [Hz]. No two axes share a line, none is a multiple of another within the band, and the spacing
-# (0.13 Hz and more) is resolved by a window of 8 s, so that the axes are uncorrelated in every window.
-# Lateral: full-state setpoints carry no jerk, so the Lee controller turns acceleration into tilt and torque only around
-# and above its attitude bandwidth (about 1 Hz), the more the closer to its lightly damped resonance with the rotor lag
-# near 5 Hz, where noise alone excites enough. Weights falling with the frequency spread the torque over
-# the lines: inertia, rotor lag and delay can be told apart only over a range of frequencies.
+# Lines of the excitation [Hz]. No two axes share a line, and no line is a multiple of another in the band. A window of
+# 8 s resolves the spacing (0.13 Hz and more), so the axes are uncorrelated in every window.
+# Lateral lines: full-state setpoints have no jerk. So the Lee controller turns acceleration into torque only around and
+# above its attitude bandwidth (about 1 Hz), most of all near its lightly damped resonance with the rotor lag at 5 Hz,
+# where noise alone excites enough. Weights that fall with the frequency spread the torque over the lines, because only
+# a range of frequencies separates inertia, rotor lag and delay.
 EXCITE_X = (1.17, 1.71, 2.33, 3.03, 3.97)
 EXCITE_Y = (1.07, 1.57, 2.17, 2.83, 3.67)
 EXCITE_Z = (0.53, 0.83, 1.27, 1.87)
@@ -163,7 +163,7 @@ EXCITE_YAW = (0.97, 1.43, 2.01, 2.93)
 
 @dataclass(frozen=True, slots=True)
 class _Multisine:
-    """Sum of sinusoids given by the amplitude of its second derivative; Schroeder phases keep the peaks low."""
+    """Sum of sinusoids q = sum a sin(w t + p); Schroeder phases keep the peaks low."""
 
     amplitude: tuple[float, ...]
     rate: tuple[float, ...]
@@ -171,7 +171,7 @@ class _Multisine:
 
     @classmethod
     def of(cls, lines: tuple[float, ...], rms: float, turn: float, *, slope: float = 0.0) -> "_Multisine":
-        """`rms` of the second derivative, shared among the lines in proportion to frequency to the power of `slope`."""
+        """A multisine with `rms` of the second derivative, shared in proportion to frequency to the power `slope`."""
         n = len(lines)
         weights = [f**slope for f in lines]
         scale = rms * math.sqrt(2 / sum(w * w for w in weights))
@@ -202,14 +202,15 @@ def excite(
 ) -> Trajectory:
     """Hover with multisines on all four axes: the manoeuvre that makes mass, inertia and rotor lag observable.
 
-    Position, velocity, acceleration and yaw are exact derivatives of each other, so feedback and feed-forward agree.
+    Position, velocity, acceleration and yaw are exact derivatives, so feedback and feed-forward agree.
 
     Args:
-        lateral: rms acceleration along world x and along y, m/s^2. Gives about 2e-4 N m of roll and pitch torque under
-            the Lee controller with its default gains. More costs height: thrust lost to tilt grows with its square.
+        lateral: rms acceleration along world x and along y, m/s^2. The default gives about 2e-4 N m of roll and pitch
+            torque with the Lee controller at its default gains. A larger value costs height: the loss of thrust by
+            tilt grows with its square.
         vertical: rms acceleration along world z, m/s^2.
         angular: rms yaw acceleration, rad/s^2 (0.05 rad of yaw, 2e-4 N m of torque).
-        ramp: s to reach full amplitude, and to stop again.
+        ramp: s to reach full amplitude, and to stop.
     """
     sines = (
         _Multisine.of(EXCITE_X, lateral, 0.3, slope=-0.5),
