@@ -1,4 +1,4 @@
-"""Links to drones, behind one narrow interface (`base.Link`); `open_link` chooses by the scheme of the URI."""
+"""Links to drones with one narrow interface (`base.Link`); `open_link` chooses a link by the scheme of the URI."""
 
 from urllib.parse import urlsplit
 
@@ -11,7 +11,7 @@ __all__ = ["open_link"]
 
 
 def open_link(uri: str) -> Link:
-    """The link for a URI, not yet connected. Raises UsageError if the URI names no link we know."""
+    """The link for a URI, not yet connected. Raises UsageError if the URI names no known link."""
     if uri.startswith("mavlink:"):
         from crazyem.links.mavlink.link import MavlinkLink
 

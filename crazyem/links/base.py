@@ -1,7 +1,7 @@
-"""The narrow interface of every link to a drone, and what some links can do besides.
+"""The narrow interface of every link to a drone, and additional abilities of some links.
 
-`Link` is what all of them do. Each further ability is a protocol of its own; `isinstance(link, ReconnectingLink)` asks
-an open link whether it has that ability.
+`Link` is common to all links. Each additional ability is a separate protocol; for example,
+`isinstance(link, ReconnectingLink)` tests whether an open link has this ability.
 """
 
 import math
@@ -38,14 +38,14 @@ __all__ = [
 
 
 class AnotherDroneError(LinkError):
-    """Somebody answers, but there is no going on with it: another firmware, or the same one started anew."""
+    """A drone answers, but the session cannot continue with it: another firmware, or a restarted one."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkLost:
-    """Put into the packet queue, once, when the drone is gone; `reason` is one sentence.
+    """Put into the packet queue, once, when the drone is lost; `reason` is one sentence.
 
-    `restarted`: whoever answers now has started anew.
+    `restarted`: a drone answers, but it has restarted.
     """
 
     reason: str
@@ -55,7 +55,7 @@ class LinkLost:
 
 @dataclass(frozen=True, slots=True)
 class ParameterWrite:
-    """What became of a parameter write: `echoed` is the value the drone confirmed, None if no echo came in time."""
+    """Result of a parameter write: `echoed` is the value in the drone's echo, None if no echo came in time."""
 
     name: str
     value: float
@@ -66,15 +66,15 @@ class ParameterWrite:
 
 @dataclass(frozen=True, slots=True)
 class LinkStatistics:
-    """Packets by fate, delays and clocks. `lost` is inferred from the firmware stamps against the block's period.
+    """Counts of packets, delays and clocks. `lost` is computed from the firmware stamps and the block's period.
 
     Attributes:
         per_block: block -> received, lost, late.
         delays: block -> median and 99th percentile of the newest packets' delay over the least-delayed ones, s.
-        round_trip: median of the newest echoes, s; NaN where unknown.
-        clock_offset, clock_rate: host time [s since the epoch] = offset + rate * firmware time [s]; NaN where unknown.
-        outages: how often the link was lost and came back.
-        duplicates: packets that the link brought again; they are dropped and count as nothing else.
+        round_trip: median of the newest echoes, s; NaN if unknown.
+        clock_offset, clock_rate: host time [s since the epoch] = offset + rate * firmware time [s]; NaN if unknown.
+        outages: number of times that the link was lost and came back.
+        duplicates: packets that the link delivered again; they are dropped and not counted otherwise.
     """
 
     received: int = 0
@@ -91,13 +91,13 @@ class LinkStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Outage:
-    """A time without a link that is over.
+    """A past time without a link.
 
     Attributes:
         reason: why the link counted as lost, one sentence.
         seconds: from the last log packet before to the first after, host clock.
         before_ms, after_ms: their stamps on the drone's clock, unwrapped, ms.
-        created: log blocks that had to be created anew.
+        created: number of log blocks that were created again.
     """
 
     reason: str
@@ -108,7 +108,7 @@ class Outage:
 
 
 def link_account(statistics: LinkStatistics, outages: Sequence[Outage]) -> dict[str, str]:
-    """What became of the packets, for a recording: clocks, round trip, and each block's fates and delays."""
+    """Statistics of a link for a recording: clocks, round trip, and each block's counts and delays."""
     account = {
         "clock.offset_s": repr(statistics.clock_offset),
         "clock.rate": repr(statistics.clock_rate),
@@ -128,7 +128,7 @@ def link_account(statistics: LinkStatistics, outages: Sequence[Outage]) -> dict[
 
 
 class Link(Protocol):
-    """A drone on the other end. Every call has a timeout of our own; none waits for ever.
+    """Interface of a link to a drone. Every call has its own timeout; none waits for ever.
 
     Units are SI throughout: m, m/s, m/s^2, rad, rad/s, s; world z up, body FLU, quaternions x y z w.
     """
@@ -171,7 +171,7 @@ class Link(Protocol):
 
 @runtime_checkable
 class StreamingLink(Protocol):
-    """A drone that sends messages by itself; nobody asks for single variables."""
+    """A link to a drone that sends messages, not single variables on request."""
 
     on_frame: Callable[[float, bytes], None] | None  # called with (host time [s], frame) for every sound frame
 
@@ -180,7 +180,7 @@ class StreamingLink(Protocol):
 
 @runtime_checkable
 class ReconnectingLink(Protocol):
-    """A link that can bring back the same drone after a `LinkLost`."""
+    """A link that can reconnect to the same drone after a `LinkLost`."""
 
     @property
     def can_reconnect(self) -> bool: ...
@@ -196,21 +196,21 @@ class ClockedLink(Protocol):
 
 @runtime_checkable
 class HostClockLink(Protocol):
-    """A link whose `Packet.host_time` is not `time.time()` but this clock, s: simulated time."""
+    """A link whose `Packet.host_time` comes from this clock [s], not from `time.time()`: simulated time."""
 
     def host_clock(self) -> float: ...
 
 
 @runtime_checkable
 class AccountingLink(Protocol):
-    """A link that knows more about lost bytes than `LinkStatistics` says."""
+    """A link with more information about lost bytes than `LinkStatistics`."""
 
     def account(self) -> Mapping[str, str]: ...
 
 
 @runtime_checkable
 class DescribingLink(Protocol):
-    """A link whose firmware describes itself, in sections for a recording."""
+    """A link whose firmware gives a description of itself, in sections for a recording."""
 
     @property
     def about(self) -> Mapping[str, Mapping[str, str]]: ...
@@ -218,17 +218,17 @@ class DescribingLink(Protocol):
 
 @runtime_checkable
 class ConfirmingLink(Protocol):
-    """A link that repeats a command to land until the drone has it; False after `timeout` [s]."""
+    """A link that repeats a command to land until the drone confirms it; False after `timeout` [s]."""
 
     def land_and_confirm(self, height: float, duration: float, *, timeout: float) -> bool: ...
 
 
 @runtime_checkable
 class HoverThrustLink(Protocol):
-    """An autopilot that takes hover thrust instead of a mass.
+    """A link to an autopilot with a parameter for hover thrust instead of mass.
 
-    `hover_parameter` is "" where none is known; `onboard_hover_estimator` says what else on board writes it, "" if
-    nothing does; `cells` of the battery are 0 while unknown.
+    `hover_parameter` is "" if none is known. `onboard_hover_estimator` describes an onboard estimator that also writes
+    this parameter, "" if there is none. `cells` is the number of battery cells, 0 if unknown.
     """
 
     @property

@@ -1,4 +1,4 @@
-"""The log blocks of one drone: created, received, counted, timed, and brought back after an outage."""
+"""The log blocks of one drone: creation, reception, counts, delays, and restart after an outage."""
 
 import contextlib
 import math
@@ -18,23 +18,23 @@ from crazyem.links.packing import PERIOD_UNIT_MS, pack, period_of
 from crazyem.links.requests import RequestClient
 from crazyem.signals.sample import Block, Packet
 
-LATE_AFTER = 0.1  # s behind the least-delayed packets after which a packet counts as late
-_START_ATTEMPT = 0.5  # s to wait for a block's first packet beyond its period, before asking again
+LATE_AFTER = 0.1  # s of delay over the least-delayed packets, above which a packet is late
+_START_ATTEMPT = 0.5  # s to wait for a block's first packet, in addition to its period, before the next attempt
 _START_ATTEMPTS = 4
-_DELAY_SAMPLES = 500  # newest packets of a block whose delays make its median and 99th percentile
-_BACKWARDS_MS = 200  # a clock that is further behind than that was reset
+_DELAY_SAMPLES = 500  # newest packets of a block, for the median and 99th percentile of their delays
+_BACKWARDS_MS = 200  # ms; a clock that goes back by more was reset
 _AHEAD_SECONDS, _FASTEST_CLOCK_RATIO = (
     2.0,
     3.0,
-)  # s, and times what the clocks' relation allows: simulators that were starved catch up
+)  # s, and factor on the time by the clock relation: a simulator that stopped for a while catches up faster
 
 
 class LogBlocks:
-    """Everything about log blocks; used by `crazyflie.CrazyflieLink`.
+    """Log blocks of one drone; used by `crazyflie.CrazyflieLink`.
 
     Args:
         uri: for messages.
-        packets: where received packets go, in order of arrival.
+        packets: queue for received packets, in order of arrival.
     """
 
     def __init__(self, uri: str, packets: "queue.SimpleQueue[Packet | LinkLost]") -> None:
@@ -48,7 +48,7 @@ class LogBlocks:
         self._clock = ClockRelation()
         self._edge: ClockFit | None = None
         self._lock = threading.Lock()
-        self._held: dict[int, int] | None = None  # while a link comes back: block -> stamp of its first packet [ms]
+        self._held: dict[int, int] | None = None  # during a reconnection: block -> stamp of its first packet [ms]
         self._newest = -math.inf
         self.outages = 0
         self.last_packet = time.monotonic()
@@ -62,13 +62,13 @@ class LogBlocks:
 
     @property
     def requests(self) -> RequestClient:
-        """For other requests over the same link."""
+        """The client for other requests over the same link."""
         assert self._requests is not None
         return self._requests
 
     @property
     def periods(self) -> list[float]:
-        """Of the running blocks, s."""
+        """Periods of the running blocks, s."""
         return [block.period_ms / 1000.0 for block, _, _ in list(self._running.values())]
 
     def available(self) -> Mapping[str, str]:
@@ -81,7 +81,7 @@ class LogBlocks:
     def subscribe(
         self, variables: Sequence[str], rate_hz: float, groups: Sequence[Sequence[str]] | None, lost: Callable[[], str]
     ) -> tuple[Block, ...]:
-        """As `CrazyflieLink.subscribe`; `lost()` is why the drone counts as lost, "" while it does not."""
+        """See `CrazyflieLink.subscribe`; `lost()` gives the reason if the drone counts as lost, else ""."""
         in_use = [b for b in self._cf.log.log_blocks if b.added or b.pending or b.started]
         blocks = pack(
             variables,
@@ -111,7 +111,7 @@ class LogBlocks:
     def _restart_in_tens(
         self, variables: Sequence[str], block: Block, groups: Sequence[Sequence[str]] | None, lost: Callable[[], str]
     ) -> tuple[Block, ...]:
-        """The first block was refused, as older firmware knows no single milliseconds: the nearest tens."""
+        """Subscribe again with a multiple of 10 ms, because older firmware refuses other periods."""
         _, config, receive = self._running.pop(block.identifier)
         config.data_received_cb.remove_callback(receive)
         self._control.delete(config.id)
@@ -121,7 +121,7 @@ class LogBlocks:
         return self.subscribe(variables, 1000.0 / tens, groups, lost)
 
     def _configuration(self, block: Block) -> Any:
-        """cflib's object for the block: it numbers blocks and takes packets apart."""
+        """cflib's object for the block, which numbers blocks and decodes packets."""
         config = _new_configuration(f"crazyem {block.identifier}", max(block.period_ms, 10))
         for variable in block.variables:
             config.add_variable(variable.name)
@@ -139,7 +139,7 @@ class LogBlocks:
             raise LinkError(f"The drone at {self._uri} lost log block {block.identifier} at once.")
 
     def _start(self, block: Block, config: Any, lost: Callable[[], str]) -> None:
-        """Start a block and see its first packet."""
+        """Start a block and wait for its first packet."""
         for _ in range(_START_ATTEMPTS):
             try:
                 self._install(block, config)
@@ -155,7 +155,7 @@ class LogBlocks:
         raise LinkError(f"Log block {block.identifier} of {self._uri} does not start: no data came.")
 
     def remove(self, *, answered: bool) -> None:
-        """Forget every block; delete them on the drone too if it is there to hear it (`answered`)."""
+        """Remove every block; also delete them on the drone if the drone answers (`answered`)."""
         for _, config, receive in self._running.values():
             with contextlib.suppress(ValueError):
                 config.data_received_cb.remove_callback(receive)
@@ -194,23 +194,23 @@ class LogBlocks:
                     return
                 if edge is not None:
                     self._delays[identifier].append(delay)
-                # Inside the lock, so that nothing overtakes when held packets are let go.
+                # Inside the lock, to keep the order of packets after `release`.
                 self._packets.put(Packet(identifier, firmware_time, host_time, tuple(data[name] for name in names)))
 
         return receive
 
     def refresh(self) -> None:
-        """Fit the clocks anew; call it a few times a second."""
+        """Update the fit of the clocks; to be called a few times a second."""
         with self._lock:
             self._edge = self._clock.fit()
 
     def clock(self) -> ClockFit | None:
-        """How the host clock runs against the firmware's, None before the first packet."""
+        """Relation of the host clock to the firmware's, None before the first packet."""
         with self._lock:
             return self._clock.fit()
 
     def statistics(self, round_trip: float = math.nan) -> LinkStatistics:
-        """Packets by fate, in total and per block, their delays and the clocks."""
+        """Counts of packets in total and per block, their delays and the clocks."""
         with self._lock:
             fates = {i: (c.received, c.lost, c.late) for i, c in self._counters.items()}
             duplicates = sum(c.duplicates for c in self._counters.values())
@@ -230,12 +230,12 @@ class LogBlocks:
     # --- after an outage --------------------------------------------------------------------------------------------
 
     def hold(self) -> None:
-        """Keep packets back until it is known whose they are."""
+        """Hold packets back until the drone is verified."""
         with self._lock:
             self._held = {}
 
     def resume(self, deadline: float) -> int:
-        """Make every block deliver again; returns how many had to be created anew.
+        """Make every block deliver again; returns the number of blocks that were created again.
 
         Raises: LinkError: no answer in time.
         """
@@ -259,7 +259,7 @@ class LogBlocks:
             return self._held is not None and identifier in self._held
 
     def reset_since(self) -> bool:
-        """Whether the drone's clock, by the packets held back, is another than before the outage: it was restarted."""
+        """Whether the drone restarted: the stamps of held packets do not fit the clock before the outage."""
         with self._lock:
             stamps = list((self._held or {}).values())
             if not stamps or not math.isfinite(self._newest):
@@ -274,9 +274,9 @@ class LogBlocks:
             return (now - self._newest) / 1000.0 > allowed
 
     def release(self) -> float:
-        """Let packets pass again; returns the newest stamp held back, unwrapped, ms.
+        """Deliver packets again; returns the newest held stamp, unwrapped, ms.
 
-        Packets held back were only looked at: each block sends others within a period.
+        Held packets are dropped: each block sends new ones within a period.
         """
         with self._lock:
             after = max((self._unwrapper.peek(s) for s in (self._held or {}).values()), default=math.nan)
@@ -291,7 +291,7 @@ class LogBlocks:
 
 
 def _new_configuration(name: str, period_ms: int) -> Any:
-    """A LogConfig that cflib takes for added, or it would start the block when it sees a reply, before it is whole."""
+    """A LogConfig that always counts as added; else cflib would start the block at a reply, before it is complete."""
     from cflib.crazyflie.log import LogConfig
 
     class Configuration(LogConfig):

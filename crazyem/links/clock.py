@@ -1,4 +1,4 @@
-"""Firmware stamps and host clock: unwrapping 24 bits, counting what never arrived, relating the two clocks."""
+"""Firmware stamps and host clock: unwrapping of 24 bits, counting of lost packets, relation of the two clocks."""
 
 import math
 import statistics
@@ -8,51 +8,51 @@ from itertools import pairwise
 
 STAMP_MODULUS = 1 << 24  # ms; the firmware sends the low 24 bits of its millisecond counter: wraps at 16777.216 s
 _HALF_MODULUS = STAMP_MODULUS // 2
-_STALL_SECONDS = 0.4  # s of host time by which all packets come later than before, after a clock stood still
-_KEPT_SECONDS = 600
-_STALL_BINS = 5  # bins (seconds of firmware time) in which not one packet was as early as before
+_STALL_SECONDS = 0.4  # s of host time, least additional delay of all packets after the firmware's clock stopped
+_KEPT_SECONDS = 600  # most bins (seconds of firmware time) that are kept
+_STALL_BINS = 5  # bins (seconds of firmware time) in which all packets must have this additional delay
 
 
 class StampUnwrapper:
-    """Continuous firmware time from 24-bit stamps, whatever order they arrive in.
+    """Continuous firmware time from 24-bit stamps, in any order of arrival.
 
-    All blocks of a drone share one clock, so one unwrapper serves them all. A stamp is placed within half a wrap
-    (8388 s) of the newest stamp seen, so packets may be lost or reordered by hours before it errs.
+    All blocks of a drone share one clock and so one unwrapper. A stamp is placed within half a wrap (8388 s) of the
+    newest stamp, so only gaps or delays of more than two hours cause an error.
     """
 
     def __init__(self) -> None:
         self._newest: int | None = None
 
     def unwrap(self, stamp: int) -> int:
-        """Unwrapped time [ms] of a stamp [ms]; the first stamp is returned as it is."""
+        """Unwrapped time [ms] of a stamp [ms]; the first stamp is returned unchanged."""
         time = self.peek(stamp)
         self._newest = time if self._newest is None else max(self._newest, time)
         return time
 
     def peek(self, stamp: int) -> int:
-        """As `unwrap`, without taking note of the stamp."""
+        """As `unwrap`, but without storing the stamp."""
         if self._newest is None:
             return int(stamp)
         return self._newest + (int(stamp) - self._newest + _HALF_MODULUS) % STAMP_MODULUS - _HALF_MODULUS
 
 
 class LossCounter:
-    """What became of one block's packets, from their stamps alone: the protocol has no sequence numbers.
+    """Counts one block's packets by their stamps alone: the protocol has no sequence numbers.
 
-    The firmware's timer keeps an exact mean period, while single packets are stamped late by up to a few periods.
-    Periods elapsed since the first packet minus packets since then is therefore the number lost, plus the lateness
-    of the newest packet, minus the lateness of the first, in periods. The minimum over the last few packets removes
-    the second term; the least value ever seen is the third.
+    The firmware's timer keeps an exact mean period, but single packets are stamped late by up to a few periods. So the
+    number of periods minus the number of packets, both since the first packet, is the number of lost packets, plus the
+    lateness of the newest packet, minus the lateness of the first, in periods. The minimum over the last few packets
+    removes the second term; the least value so far is the third.
 
-    A stamp that was here before is a duplicate, which the link made, and counts for nothing else. There is one
-    exception: after a delay the firmware samples at once what is overdue, and two packets share a millisecond (1 in 500
-    of the real firmware's, each after a gap of two periods). So a repeated stamp is a packet while one is overdue, that
-    is, after a gap wider than a period. A packet that is doubled just after a loss looks the same, and hides that loss.
+    A packet with a repeated stamp is a duplicate made by the link and is not counted otherwise. There is one exception:
+    after a delay the firmware samples an overdue packet at once, and two packets have the same millisecond (1 in 500 of
+    the real firmware's, each after a gap of two periods). So a repeated stamp counts as a packet if one is overdue,
+    that is, after a gap longer than a period. A duplicate just after a loss looks the same and hides the loss.
     """
 
-    _SETTLING = 10  # packets; longer than any burst of late ones seen
-    _MEMORY = 1000  # newest stamps among which a duplicate is recognised
-    _ON_TIME = 0.75  # periods from one packet to the next: more, and nothing is overdue any more
+    _SETTLING = 10  # packets; longer than a burst of late ones
+    _MEMORY = 1000  # newest stamps in which duplicates are recognised
+    _ON_TIME = 0.75  # periods between two packets, from which no packet is overdue any more
 
     def __init__(self, period_ms: int) -> None:
         self.period_ms = int(period_ms)
@@ -60,16 +60,16 @@ class LossCounter:
         self.late = 0
         self.duplicates = 0
         self._stamps: deque[int] = deque(maxlen=self._MEMORY)
-        self._overdue = math.inf  # packets that may still come with the newest stamp; before the first any number
+        self._overdue = math.inf  # packets that may still come with the newest stamp; unlimited before the first
         self._first = 0
         self._newest = 0
         self._missing: deque[float] = deque(maxlen=self._SETTLING)
         self._least = 0.0
 
     def count(self, firmware_time_ms: int, *, late: bool = False) -> bool:
-        """Account for a packet stamped `firmware_time_ms` (unwrapped); False: a duplicate.
+        """Count a packet with the stamp `firmware_time_ms` (unwrapped); False: a duplicate.
 
-        `late`: whether the host got it with delay.
+        `late`: whether it arrived with a delay.
         """
         if self.received == 0:
             self._first = self._newest = firmware_time_ms
@@ -95,12 +95,12 @@ class LossCounter:
         seen = stamp in self._stamps
         if seen and (gap < 0.0 or self._overdue < self._ON_TIME):
             return True
-        self._overdue = max(self._overdue - 1.0, 0.0)  # one of those that were due: it was late, or overtaken
+        self._overdue = max(self._overdue - 1.0, 0.0)  # an overdue packet: late or overtaken
         return False
 
     @property
     def lost(self) -> int:
-        """Packets that should have come between the first and the newest and did not (the newest few excepted)."""
+        """Number of missing packets between the first and the newest, without the newest few."""
         return round(min(self._missing) - self._least) if self._missing else 0
 
 
@@ -112,7 +112,7 @@ class ClockFit:
         offset: s.
         rate: host seconds per firmware second (1 for a real drone, 1/speed for an accelerated simulator).
         delay: median delay of the packets over the least-delayed ones, s.
-        packets: how many packets the fit rests on.
+        packets: number of packets behind the fit.
     """
 
     offset: float
@@ -128,8 +128,8 @@ class ClockFit:
 class ClockRelation:
     """Fits the host clock against the firmware clock through the least-delayed packet of every second.
 
-    Queues and schedulers only ever delay a packet, so the lower edge of (host - firmware) is the clock relation and
-    the rest is delay. Memory is bounded: one candidate a second, the newest ten minutes of them.
+    Queues and schedulers can only delay a packet, so the lower edge of (host - firmware) is the clock relation, and the
+    rest is delay. The memory is bounded: one candidate per second, for the newest ten minutes.
     """
 
     def __init__(self) -> None:
@@ -139,7 +139,7 @@ class ClockRelation:
         self._packets = 0
 
     def add(self, firmware_time_ms: int, host_time: float) -> None:
-        """Take note of a packet: unwrapped stamp [ms] and arrival [s since the epoch]."""
+        """Add a packet: unwrapped stamp [ms] and arrival [s since the epoch]."""
         firmware = firmware_time_ms / 1000.0
         if self._origin is None:
             self._origin = (firmware, host_time)
@@ -156,9 +156,9 @@ class ClockRelation:
                 self._bins.pop(next(iter(self._bins)))
 
     def _forget_before_stall(self) -> None:
-        """A simulator that was denied the processor stood still: what was before that says nothing of now.
+        """Drop packets from before a stop of the firmware's clock (a simulator without the processor).
 
-        Seen as a step up by more than any delay worth the name, from which not one packet in seconds comes back.
+        A stop is a step of `_STALL_SECONDS` or more in the delay of all packets for at least `_STALL_BINS` seconds.
         """
         points = list(self._bins.values())
         if len(points) < 2 * _STALL_BINS:
@@ -166,7 +166,7 @@ class ClockRelation:
         slopes = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(points) if b[0] > a[0]]
         rate = statistics.median(slopes) if slopes else 1.0
         level = [y - rate * x for x, y in points]
-        lowest = math.inf  # of what follows
+        lowest = math.inf  # of the later bins
         for i in range(len(points) - 2, -1, -1):
             lowest = min(lowest, level[i + 1])
             if len(points) - 1 - i >= _STALL_BINS and lowest - level[i] > _STALL_SECONDS:
@@ -175,7 +175,7 @@ class ClockRelation:
                 return
 
     def fit(self) -> ClockFit | None:
-        """The relation so far, or None before the first packet. The rate is 1 until three seconds have been seen."""
+        """The present relation, None before the first packet. The rate is 1 with less than three seconds of data."""
         if self._origin is None:
             return None
         self._forget_before_stall()

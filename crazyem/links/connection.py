@@ -1,7 +1,7 @@
-"""Opening and closing a cflib link within bounded time: cflib waits for ever for any reply that is lost.
+"""Opening and closing a cflib link within bounded time: cflib itself waits for ever for a lost reply.
 
-Three nets, one below the other: a request without an answer is sent again (`requests.py`); a connection that stands
-still nevertheless is given up and begun anew, a little later each time; and all of it ends at the caller's timeout.
+There are three levels. A request without an answer is sent again (`requests.py`). A connection attempt without progress
+is given up and repeated after a pause. All attempts end at the caller's timeout.
 """
 
 import contextlib
@@ -13,14 +13,14 @@ from typing import Any
 from crazyem.errors import LinkError
 from crazyem.links.requests import RetryTransport
 
-SILENCE_LIMIT = 3.0  # s without a new answer before a connection attempt is given up
-CONNECT_ATTEMPTS = 3  # at a drone that does answer, but not everything
-_FIRST_PAUSE = 0.2  # s before the second attempt, twice that before the third
+SILENCE_LIMIT = 3.0  # s without a new answer, after which a connection attempt is given up
+CONNECT_ATTEMPTS = 3  # for a drone that answers some requests
+_FIRST_PAUSE = 0.2  # s before the second attempt; doubled before the third
 _LOG_DATA = (5, 2)
 _CONSOLE_PORT = 0
 _LINK_PORT = 15
 
-# (port, channel) of a request -> what its reply would have been, for the error message
+# (port, channel) of a request -> content of its reply, for the error message
 _STAGES: dict[tuple[int, int], str] = {
     (15, 1): "its name",
     (13, 1): "its protocol version",
@@ -35,14 +35,14 @@ _STAGES: dict[tuple[int, int], str] = {
 
 
 def quiet_cflib() -> None:
-    """Keep cflib's warnings off the terminal; a program that configures logging still gets them."""
+    """Hide cflib's warnings from the terminal; a program that configures logging still gets them."""
     logger = logging.getLogger("cflib")
     if not any(isinstance(handler, logging.NullHandler) for handler in logger.handlers):
         logger.addHandler(logging.NullHandler())
 
 
 def new_crazyflie(uri: str) -> Any:
-    """A fresh cflib Crazyflie, drivers initialised once, without cache files."""
+    """A new cflib Crazyflie without cache files; drivers are initialised once."""
     quiet_cflib()
     import cflib.crtp
     from cflib.crazyflie import Crazyflie
@@ -52,8 +52,8 @@ def new_crazyflie(uri: str) -> Any:
         cflib.crtp.CLASSES.clear()
         cflib.crtp.init_drivers(enable_serial_driver=uri.startswith("serial"))
     crazyflie = Crazyflie(ro_cache=None, rw_cache=None)
-    # cflib 0.1.34 joins its ping thread in whoever meets the link's end. If that is a sender, it holds the lock that
-    # the ping thread waits for, and neither ever comes back; a ping thread that is only told to stop ends by itself.
+    # cflib 0.1.34 joins its ping thread in the thread that notices the end of the link. A sending thread would hold the
+    # lock that the ping thread waits for: a deadlock. So the ping thread is stopped, not joined; it ends by itself.
     latency = crazyflie.link_statistics.latency
     latency.stop = latency._stop_event.set
     return crazyflie
@@ -94,11 +94,11 @@ class _Progress:
             self.awaited = stage
 
     def _received(self, packet: Any) -> None:
-        # Log data of a former session, console text and ping echoes say nothing about our requests.
+        # Log data of an earlier session, console text and ping echoes are no answers to our requests.
         key = (packet.port, packet.channel)
         if key == _LOG_DATA or packet.port == _CONSOLE_PORT or key == (_LINK_PORT, 0):
             return
-        # Nor does an answer that came before: it is what cflib made nothing of, asked for again and again.
+        # A repeated answer is no progress: cflib could not use it and requests it again.
         answer = (*key, bytes(packet.data))
         if answer not in self._seen:
             self._seen.add(answer)
@@ -115,13 +115,13 @@ class _Progress:
 
 
 def connect(uri: str, timeout: float) -> Any:
-    """A connected cflib Crazyflie, tables and every parameter value read; `timeout` [s] is for all attempts together.
+    """A connected cflib Crazyflie with tables and all parameter values; `timeout` [s] is for all attempts together.
 
-    Raises: LinkError with one sentence that tells "nothing answers" from "a reply was lost". Nothing stays open.
+    Raises: LinkError: one sentence, which distinguishes "nothing answers" from "a reply was lost". Nothing stays open.
     """
     deadline = time.monotonic() + timeout
     pause = _FIRST_PAUSE
-    earlier_error: LinkError | None = None  # what was missing at a drone that did answer
+    earlier_error: LinkError | None = None  # of an attempt with some answers
     for attempt in range(CONNECT_ATTEMPTS):
         crazyflie = new_crazyflie(uri)
         progress = _Progress(crazyflie)
@@ -129,9 +129,9 @@ def connect(uri: str, timeout: float) -> Any:
             _open(crazyflie, progress, uri, deadline, timeout)
             return crazyflie
         except LinkError as error:
-            # A later silence says less than what an earlier attempt missed.
+            # The error of an attempt with answers says more than that of a later one without.
             earlier_error = error if progress.answers or earlier_error is None else earlier_error
-            # Where nobody ever answers, or time is up, there is nothing to try again.
+            # No further attempt if nothing ever answered or the time is over.
             answered = progress.answers or earlier_error is not error
             if not answered or attempt == CONNECT_ATTEMPTS - 1 or time.monotonic() + pause >= deadline:
                 raise earlier_error from None
@@ -143,7 +143,7 @@ def connect(uri: str, timeout: float) -> Any:
 
 
 def _open(crazyflie: Any, progress: _Progress, uri: str, deadline: float, timeout: float) -> None:
-    """One attempt."""
+    """One connection attempt. Raises LinkError; then the link is closed."""
     try:
         _begin(crazyflie, uri)
         while not progress.wake.wait(0.01):
@@ -161,7 +161,7 @@ def _open(crazyflie: Any, progress: _Progress, uri: str, deadline: float, timeou
 
 
 def _begin(crazyflie: Any, uri: str) -> None:
-    """What `Crazyflie.open_link` does (cflib 0.1.34), with a `RetryTransport` around its driver from the start."""
+    """Same as `Crazyflie.open_link` (cflib 0.1.34), but with a `RetryTransport` around the driver."""
     from cflib.crazyflie import State
 
     crazyflie.connection_requested.call(uri)
@@ -181,7 +181,7 @@ def _begin(crazyflie: Any, uri: str) -> None:
 
 
 def new_driver(crazyflie: Any, uri: str) -> Any:
-    """A driver for the URI in a `RetryTransport`, None if there is none; raises whatever the driver raises."""
+    """A driver for the URI in a `RetryTransport`, None if there is none; may raise any error of the driver."""
     import cflib.crtp
 
     statistics = crazyflie.link_statistics.radio_link_statistics_callback
@@ -219,17 +219,16 @@ def _why_failed(progress: _Progress, uri: str) -> str:
 
 
 def shut(crazyflie: Any, *, hand_back: bool = False, cut_motors: bool = False) -> None:
-    """Close a cflib link in bounded time (about two seconds at most), without cflib's parting setpoint.
+    """Close a cflib link in bounded time (about two seconds at most), without cflib's last setpoint.
 
-    `Crazyflie.close_link` always sends a zero roll-pitch-yaw-thrust setpoint. In the firmware any low-level setpoint
-    locks out the high-level commander until it is told "notify stop", so the next client's take-off would silently do
-    nothing; and a mere observer would cut the motors of a flying drone. The link is therefore taken out of the
-    object before `close_link` sees it.
+    `Crazyflie.close_link` always sends a zero roll-pitch-yaw-thrust setpoint. Any low-level setpoint locks out the
+    firmware's high-level commander until "notify stop". So the next client's take-off would do nothing, and an observer
+    would cut the motors of a flying drone. Therefore the link is removed from the object before `close_link`.
 
     Args:
         crazyflie: a cflib Crazyflie, connected or not.
         hand_back: send "notify stop", so that the next client's high-level commands work.
-        cut_motors: send the zero setpoint first, as cflib does: a client that commanded must not leave motors on.
+        cut_motors: send the zero setpoint first, as cflib does: a client that sent commands must not leave motors on.
     """
     link = crazyflie.link
     if link is not None:
@@ -239,7 +238,7 @@ def shut(crazyflie: Any, *, hand_back: bool = False, cut_motors: bool = False) -
             if hand_back:
                 crazyflie.commander.send_notify_setpoint_stop()
             shorten_socket_timeout(crazyflie)
-            crazyflie.link_statistics.latency.ping()  # its echo ends the receiver's present nap
+            crazyflie.link_statistics.latency.ping()  # its echo wakes the receiver
     link = take_link(crazyflie)  # sending may have failed and closed it
     if link is not None:
         _wake(crazyflie, link)
@@ -250,7 +249,7 @@ def shut(crazyflie: Any, *, hand_back: bool = False, cut_motors: bool = False) -
 
 
 def take_link(crazyflie: Any) -> Any:
-    """Take the driver out of the object, not in the middle of a send: a sender would die holding cflib's lock."""
+    """Remove the driver from the object, but not during a send: the sender would end with cflib's lock held."""
     lock: Any = getattr(crazyflie, "_send_lock", None)
     held = lock is not None and lock.acquire(timeout=0.5)
     try:
@@ -262,14 +261,14 @@ def take_link(crazyflie: Any) -> Any:
 
 
 def shorten_socket_timeout(crazyflie: Any) -> None:
-    """Let cflib's udp receiver look every 0.1 s, not every second, whether it should stop: closing waits for it."""
+    """Let cflib's UDP receiver check for a stop every 0.1 s, not every second, because closing waits for it."""
     with contextlib.suppress(Exception):
         if crazyflie.link.socket.gettimeout() is not None:
             crazyflie.link.socket.settimeout(0.1)
 
 
 def _wake(crazyflie: Any, link: Any) -> None:
-    """Spare the second cflib's dispatcher would sleep through before it sees that it should stop."""
+    """Wake cflib's dispatcher, which otherwise notices a stop only after a second."""
     with contextlib.suppress(Exception):
         crazyflie.incoming.stop()
         link.in_queue.put(None)

@@ -1,4 +1,4 @@
-"""A Crazyflie over unmodified cflib: everything with a time limit, losses counted, a lost drone reported once."""
+"""A link to a Crazyflie over unmodified cflib, with time limits, counts of losses, and one report of a lost drone."""
 
 import contextlib
 import math
@@ -22,18 +22,18 @@ from crazyem.links.reconnection import Reconnector
 from crazyem.links.requests import land_command, send_until_confirmed
 from crazyem.signals.sample import Block, Packet
 
-SILENT_AFTER = 2.0  # s without log data, while blocks run, after which the drone counts as lost
+SILENT_AFTER = 2.0  # s without log data from running blocks, after which the drone counts as lost
 _ECHO = (15, 0)
 _ECHO_STAMP = struct.Struct("<Bd")  # of cflib's pings: a mark, and host time [s]
-_ECHOES = 50  # newest, for the median of the round trip
+_ECHOES = 50  # newest echoes, for the median of the round trip
 
 
 class CrazyflieLink:
     """The link interface (`base.Link`) for one Crazyflie.
 
     Attributes:
-        uri: where the drone is.
-        packets: log packets in order of arrival; at the end one `LinkLost` if the drone went away.
+        uri: address of the drone.
+        packets: log packets in order of arrival; one `LinkLost` at the end if the drone is lost.
     """
 
     def __init__(self, uri: str) -> None:
@@ -57,7 +57,7 @@ class CrazyflieLink:
 
     @classmethod
     def from_crazyflie(cls, crazyflie: Any) -> "CrazyflieLink":
-        """Ride on an open cflib Crazyflie without owning it: `close` then only removes our log blocks.
+        """A link over an open cflib Crazyflie of another owner: `close` then only removes our log blocks.
 
         Raises: UsageError if the object is not connected.
         """
@@ -73,9 +73,9 @@ class CrazyflieLink:
     def connect(self, timeout: float = 30.0) -> None:
         """Connect and read all tables and parameter values.
 
-        Requests whose answer is lost are repeated, and a connection that stands still is begun anew.
+        Requests without an answer are repeated, and a connection attempt without progress starts again.
 
-        Raises: LinkError: nothing answers, or not everything within `timeout` [s].
+        Raises: LinkError: nothing answers, or some answers are missing after `timeout` [s].
         """
         if self._cf is not None:
             return
@@ -102,10 +102,10 @@ class CrazyflieLink:
         self._watcher.start()
 
     def close(self) -> None:
-        """Remove our log blocks and, on a link of our own, disconnect; returns within a few seconds, always.
+        """Remove our log blocks and disconnect if the link is our own; always returns within a few seconds.
 
-        A session that commanded the drone ends with motors off and "notify stop", so that the next client can use the
-        high-level commander (see `connection.shut`); one that only watched sends no setpoint at all.
+        A session that sent commands ends with motors off and "notify stop", so that the next client can use the
+        high-level commander (see `connection.shut`). A session without commands sends no setpoint.
         """
         crazyflie, self._cf = self._cf, None
         if crazyflie is None:
@@ -150,9 +150,9 @@ class CrazyflieLink:
 
         Args:
             variables: names, in any order.
-            rate_hz: of every one of them: 0.4 to 100 Hz, rounded to periods of 10 ms; up to 1000 Hz, rounded to 1 ms,
-                with firmware that starts blocks by the millisecond.
-            groups: names that must be sampled together; None = the parts of each signal.
+            rate_hz: of all variables: 0.4 to 100 Hz, rounded to periods of 10 ms; up to 1000 Hz, rounded to 1 ms, if
+                the firmware allows periods in milliseconds.
+            groups: names that must be sampled together; None = the components of each signal.
 
         Raises: UsageError (unknown variable, does not fit, too fast for this firmware), LinkError (does not start).
         """
@@ -160,12 +160,12 @@ class CrazyflieLink:
         return self._blocks.subscribe(variables, rate_hz, groups, lambda: self._lost)
 
     def statistics(self) -> LinkStatistics:
-        """Packets received, lost (inferred from stamps) and late, delays, clocks: in total and per block."""
+        """Packets received, lost (computed from stamps) and late, delays, clocks: in total and per block."""
         trips = list(self._round_trips)
         return self._blocks.statistics(statistics.median(trips) if trips else math.nan)
 
     def clock(self) -> ClockFit | None:
-        """How the host clock runs against the firmware's, None before the first packet."""
+        """Relation of the host clock to the firmware's, None before the first packet."""
         return self._blocks.clock()
 
     # --- the end of a link --------------------------------------------------------------------------------------
@@ -175,7 +175,7 @@ class CrazyflieLink:
         if (packet.port, packet.channel) == _ECHO and len(packet.data) == _ECHO_STAMP.size:
             self._last_echo = self._last_packet
             took = time.time() - _ECHO_STAMP.unpack(bytes(packet.data))[1]
-            if 0.0 <= took < 10.0:  # another's echo, a harmed one, or a host clock that was set
+            if 0.0 <= took < 10.0:  # else: another client's echo, a damaged one, or a host clock that was set
                 self._round_trips.append(took)
 
     def _on_connection_lost(self, _uri: str, _message: str) -> None:
@@ -193,7 +193,7 @@ class CrazyflieLink:
         self.packets.put(LinkLost(reason, time.time()))
 
     def _watch(self) -> None:
-        """A peer that falls silent raises nothing in cflib: compare the times of the last packets with the clock."""
+        """Report a silent drone as lost, by the times of the last packets: cflib does not notice silence."""
         while not self._stop.wait(0.2):
             self._blocks.refresh()
             periods = self._blocks.periods
@@ -206,24 +206,24 @@ class CrazyflieLink:
                 what = "nothing has come" if silent else "it still answers but sends no log data (has it restarted?)"
                 self._report_lost(f"The drone at {self.uri} was lost: {what} for {limit:g} s.")
             elif self._owned and self._last_echo is not None and now - self._last_echo > limit:
-                what = "it sends, but has answered nothing"  # setpoints do not arrive either
+                what = "it sends, but has answered nothing"  # so setpoints do not arrive
                 self._report_lost(f"The drone at {self.uri} was lost: {what} for {limit:g} s.")
 
     @property
     def can_reconnect(self) -> bool:
-        """Whether `reconnect` may bring a lost link back: it is ours, and nothing speaks against it."""
+        """Whether `reconnect` may succeed: the link is our own, and the drone is not known to have restarted."""
         return self._reconnector is not None and not self._unrecoverable
 
     def reconnect(self, timeout: float = 5.0, abort: threading.Event | None = None) -> Outage:
-        """After a `LinkLost`: bring the same drone's link back, blocks and all; packets then go on under their numbers.
+        """After a `LinkLost`: reconnect to the same drone; its blocks then go on with the same numbers.
 
-        Setpoints are sent meanwhile whenever there is something to send them through: a link may be lost one way only.
+        Setpoints can still be sent during this time, because a link may be lost in one direction only.
 
         Args:
             timeout: s.
-            abort: set it to give up earlier.
+            abort: set by the caller to give up earlier.
 
-        Raises: LinkError: not in time, or there is no going on (restarted, another firmware, not a link of ours).
+        Raises: LinkError: not in time, or impossible (restarted, another firmware, not our own link).
         """
         if not self._lost or self._cf is None:
             raise LinkError(f"The link to {self.uri} is not lost.")
@@ -239,7 +239,7 @@ class CrazyflieLink:
             raise
         finally:
             self._reconnecting = False
-        self._last_echo = None  # to be heard again first
+        self._last_echo = None  # unknown until the next echo
         now = time.monotonic()
         after = self._blocks.release()
         with self._lock:
@@ -262,13 +262,15 @@ class CrazyflieLink:
 
     @property
     def parameter_fault(self) -> str:
-        """Why the last parameter access went unanswered; "" while parameters work."""
+        """Why the last parameter access had no answer; "" if parameters work."""
         return self._parameters.fault if self._parameters is not None else ""
 
     @property
     def about(self) -> Mapping[str, Mapping[str, str]]:
-        """What the firmware says of itself, for recordings: sections "firmware" (protocol, revision), "log_types",
-        "parameter_types" and "parameter_values" (as read while connecting)."""
+        """Description of the firmware for recordings.
+
+        Sections "firmware" (protocol, revision), "log_types", "parameter_types", "parameter_values" (at connect).
+        """
         crazyflie = self._connected()
         values = {f"{g}.{n}": str(v) for g, names in crazyflie.param.values.items() for n, v in names.items()}
         firmware = {name: values[f"firmware.{name}"] for name in ("revision0", "revision1", "modified")
@@ -282,7 +284,7 @@ class CrazyflieLink:
         }
 
     def read_parameter(self, name: str, timeout: float = 2.0) -> float:
-        """The value in the firmware now, asked for afresh. Raises UsageError or LinkError."""
+        """The present value in the firmware, by a new request. Raises UsageError or LinkError."""
         return self._parameter_client().read(name, timeout)
 
     def write_parameter(self, name: str, value: float, timeout: float = 1.0) -> ParameterWrite:
@@ -290,8 +292,8 @@ class CrazyflieLink:
 
         No echo within `timeout` gives `verified=False` and a `parameter_fault`; the link stays usable.
 
-        Raises: UsageError for an unknown or read-only parameter or a value that does not fit its type; LinkError if
-        the drone is known to be gone.
+        Raises: UsageError: an unknown or read-only parameter, or a value that does not fit its type. LinkError: the
+        drone is lost.
         """
         return self._parameter_client().write(name, value, timeout)
 
@@ -313,7 +315,7 @@ class CrazyflieLink:
     def arm(self, armed: bool) -> None:
         """Arm or disarm (brushless drones need it; brushed ones arm themselves)."""
         crazyflie = self._command()
-        with warnings.catch_warnings():  # cflib warns about protocols before 12, and then does the right thing
+        with warnings.catch_warnings():  # cflib warns about protocols before 12, but handles them
             warnings.simplefilter("ignore")
             crazyflie.supervisor.send_arming_request(bool(armed))
 
@@ -326,7 +328,7 @@ class CrazyflieLink:
         self._command().high_level_commander.land(height, duration)
 
     def land_and_confirm(self, height: float, duration: float, *, timeout: float) -> bool:
-        """As `land`, sent until the drone says that it has the command; False if it did not within `timeout` [s]."""
+        """As `land`, repeated until the drone confirms the command; False if it does not within `timeout` [s]."""
         command = land_command(height, duration)
         return send_until_confirmed(self._command(), command, timeout=timeout, repeat_after=0.04)
 
@@ -349,7 +351,7 @@ class CrazyflieLink:
             velocity: m/s, world.
             acceleration: m/s^2, world, without gravity.
             quaternion: x, y, z, w, body to world.
-            body_rate: rad/s, body (the wire carries mrad/s, whatever cflib's docstring says).
+            body_rate: rad/s, body (sent in mrad/s; cflib's docstring is wrong).
         """
         commander = self._command().commander
         try:
@@ -369,11 +371,11 @@ class CrazyflieLink:
         self._command().commander.send_hover_setpoint(vx, vy, math.degrees(yaw_rate), z)
 
     def release_setpoints(self) -> None:
-        """ "Notify stop": low-level setpoints have ended, the high-level commander may act again."""
+        """Send "notify stop": low-level setpoints have ended, and the high-level commander may act again."""
         self._command().commander.send_notify_setpoint_stop()
 
     def stop(self) -> None:
-        """Motors off now, for low-level setpoints and the high-level commander alike."""
+        """Motors off now, both for low-level setpoints and for the high-level commander."""
         crazyflie = self._command()
         crazyflie.high_level_commander.stop()
         crazyflie.commander.send_stop_setpoint()

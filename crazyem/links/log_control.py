@@ -1,7 +1,7 @@
-"""Creating, starting and deleting log blocks, every reply awaited: cflib ignores those of appended variables.
+"""Creation, start and deletion of log blocks with a check of every reply: cflib ignores those for appended variables.
 
-Most of our blocks have ten variables or more, which take two packets. Were the second one lost, the block would
-deliver packets that are too short; were it repeated, its variables would be in the block twice.
+Most of our blocks have ten variables or more, which need two packets. If the second packet is lost, the block delivers
+packets that are too short. If it is repeated, the block has its variables twice.
 """
 
 import struct
@@ -20,7 +20,7 @@ _REASONS = {
     12: "no memory left for blocks or variables",
     _EEXIST: "it exists already",
 }
-_ITEMS_A_PACKET = 9  # of 3 bytes, in 28
+_ITEMS_A_PACKET = 9  # of 3 bytes each, in 28 bytes
 REPLY_WITHIN, REPEAT_AFTER = 0.5, 0.15  # s
 INSTALL_ATTEMPTS = 5
 
@@ -34,7 +34,7 @@ class LogControl:
         self._requests, self._uri = requests, uri
 
     def install(self, identifier: int, items: Items) -> None:
-        """Make the block exist with exactly these variables, whatever was there under its number.
+        """Create the block with exactly these variables; replaces a block with the same number.
 
         Raises: LinkError: no answer, or refused.
         """
@@ -46,7 +46,7 @@ class LogControl:
                 head = bytes((_APPEND if number else _CREATE, identifier))
                 body = b"".join(struct.pack("<BH", kind, index) for kind, index in part)
                 status = self._command(head + body, repeat=False)
-                if status in (None, _EEXIST):  # unknown what is in the block now: away with it
+                if status in (None, _EEXIST):  # the content of the block is unknown: delete it
                     break
                 if status:
                     raise LinkError(f"The drone at {self._uri} refused log block {identifier}: {_reason(status)}.")
@@ -57,9 +57,9 @@ class LogControl:
     def start(self, identifier: int, period_ms: int) -> bool:
         """Start the block; False if it does not exist.
 
-        Periods that are no multiple of 10 ms need the firmware's start by milliseconds, which cflib does not use.
+        Periods that are not a multiple of 10 ms need a start command in milliseconds, which cflib does not use.
 
-        Raises: UsageError: this firmware cannot. LinkError: no answer, or refused.
+        Raises: UsageError: the firmware does not have this command. LinkError: no answer, or refused.
         """
         if period_ms % 10 == 0:
             status = self._command(bytes((_START, identifier, period_ms // 10)))
@@ -76,11 +76,11 @@ class LogControl:
         return status == 0
 
     def delete(self, identifier: int) -> bool:
-        """Delete the block if it is there; whether somebody answered."""
+        """Delete the block if it exists; returns whether the drone answered."""
         return self._command(bytes((_DELETE, identifier))) is not None
 
     def _command(self, data: bytes, *, repeat: bool = True) -> int | None:
-        """Status of a command, None if it was not answered."""
+        """Status of a command, None without an answer."""
         after = REPEAT_AFTER if repeat else None
         reply = self._requests.request(_PORT, _CONTROL, data, timeout=REPLY_WITHIN, repeat_after=after)
         return reply[2] if reply is not None and len(reply) > 2 else None

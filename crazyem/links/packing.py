@@ -1,4 +1,4 @@
-"""Packing log variables into blocks: 26 bytes a packet, 16 blocks, 128 variables; users never count bytes."""
+"""Packing of log variables into blocks: 26 bytes per packet, 16 blocks, 128 variables."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -18,9 +18,9 @@ HIGHEST_RATE = 1000.0  # Hz; the firmware's timers count milliseconds
 def period_of(rate_hz: float) -> int:
     """Log period [ms] for a rate [Hz].
 
-    Up to 100 Hz a multiple of 10 ms, at most 2540, which every firmware can, unless the rate is that of another whole
-    number of milliseconds. Beyond, whole milliseconds. For these the firmware needs the start by milliseconds (protocol
-    4 knows only tens). Raises UsageError outside 0.394..1000 Hz.
+    A rate with a period of whole milliseconds gets this period. Other rates up to 100 Hz get a multiple of 10 ms (at
+    most 2540), which every firmware supports; higher rates get whole milliseconds. Other periods than multiples of
+    10 ms need a newer firmware (protocol 4 has only these). Raises UsageError outside 0.394..1000 Hz.
     """
     if not rate_hz > 0:
         raise UsageError(
@@ -45,22 +45,22 @@ def pack(
     blocks_in_use: int = 0,
     variables_in_use: int = 0,
 ) -> tuple[Block, ...]:
-    """Distribute variables over as few blocks as possible, keeping groups together.
+    """Distribute variables over as few blocks as possible; groups stay together.
 
-    A group is a set of variables that must be sampled at the same instant; it stays in one block unless it alone
-    exceeds a packet. Groups are placed first, the largest first, each into the first block with room (first-fit
-    decreasing); the order within a block is the order in which the variables were asked for.
+    A group is a set of variables that must be sampled at the same instant; it stays in one block unless it is larger
+    than a packet. Groups and single variables are placed by size, the largest first, each into the first block with
+    room (first-fit decreasing). The order within a block is the order of `variables`.
 
     Args:
-        variables: names wanted; repetitions are ignored.
+        variables: names; repetitions are ignored.
         available: the drone's log variables: name -> C type.
         period_ms: period of every block, ms.
-        groups: tuples of names to keep together; None = the parts of each signal (`sampled_together`).
+        groups: tuples of names to keep together; None = the components of each signal (`sampled_together`).
         first_identifier: identifier of the first block.
-        blocks_in_use: blocks already taken on the drone.
-        variables_in_use: variables already in those blocks.
+        blocks_in_use: blocks already in use on the drone.
+        variables_in_use: variables already in these blocks.
 
-    Raises: UsageError naming the variable that does not exist, or what does not fit.
+    Raises: UsageError: a variable does not exist, or the variables do not fit.
     """
     wanted = list(dict.fromkeys(variables))
     for name in wanted:
@@ -108,7 +108,7 @@ def _first_fit(units: Sequence[tuple[str, ...]], size: Mapping[str, int]) -> lis
 def _units(
     wanted: Sequence[str], size: Mapping[str, int], groups: Sequence[Sequence[str]] | None
 ) -> list[tuple[str, ...]]:
-    """Disjoint sets to place as a whole: the groups (a later one keeps what earlier ones left), then the rest."""
+    """Disjoint sets to place as a whole: the groups (without variables of earlier groups), then single variables."""
     units: list[tuple[str, ...]] = []
     taken: set[str] = set()
     for group in sampled_together(wanted) if groups is None else groups:
@@ -118,7 +118,7 @@ def _units(
         taken.update(names)
         if sum(size[n] for n in names) <= MAX_BYTES:
             units.append(names)
-        else:  # more than a packet: cannot be sampled together, whatever we do
+        else:  # larger than a packet: cannot be sampled together
             units.extend((n,) for n in names)
     units.extend((n,) for n in wanted if n not in taken)
     return units

@@ -1,8 +1,8 @@
 """Reading and writing parameters over a cflib Crazyflie, verified and with our own time limits.
 
-cflib's own writer waits for an echo for ever and takes every later write down with it when one is lost. The packets
-here travel beside it: sent through `Crazyflie.send_packet`, sent again while unanswered (a write is idempotent), and
-matched to their echo by a port callback. A lost echo so costs one unverified write, never the parameter path.
+cflib's own writer waits for ever for a lost echo and blocks all later writes. This module does not use it: packets are
+sent through `Crazyflie.send_packet`, repeated without an answer (a write is idempotent), and matched to their echo by a
+port callback. So a lost echo costs only one unverified write.
 """
 
 import functools
@@ -26,7 +26,7 @@ class ParameterClient:
     """Verified parameter access for one connected cflib Crazyflie object.
 
     Attributes:
-        fault: why the last access went unanswered, one sentence; "" while parameters work.
+        fault: why the last access had no answer, one sentence; "" if parameters work.
     """
 
     def __init__(self, crazyflie: Any, uri: str) -> None:
@@ -51,7 +51,7 @@ class ParameterClient:
         return {f"{group}.{name}": item.ctype for group, items in table.items() for name, item in items.items()}
 
     def read(self, name: str, timeout: float) -> float:
-        """The value the firmware holds now. Raises UsageError (unknown name) or LinkError (no answer in time)."""
+        """The present value in the firmware. Raises UsageError (unknown name) or LinkError (no answer in time)."""
         element = self._element(name)
         identifier = struct.pack("<H", element.ident)
         with self._lock:
@@ -65,9 +65,9 @@ class ParameterClient:
         raise LinkError(self.fault)
 
     def write(self, name: str, value: float, timeout: float) -> ParameterWrite:
-        """Write a value and wait for its echo; never raises for a silent drone, the result says what happened.
+        """Write a value and wait for its echo; without an echo the result is not verified.
 
-        Raises: UsageError for an unknown or read-only parameter, or a value its type cannot hold.
+        Raises: UsageError: an unknown or read-only parameter, or a value that its type cannot hold.
         """
         element = self._element(name)
         if element.access == element.RO_ACCESS:
@@ -91,7 +91,7 @@ class ParameterClient:
         return ParameterWrite(name, value, echoed, False, time.time())
 
     def _replies_to(self, channel: int, identifier: bytes, payload: bytes, timeout: float) -> Iterator[bytes]:
-        """Send until `timeout`, yielding each reply on the channel that carries the identifier."""
+        """Repeat the request until `timeout`, and yield each reply on the channel with the identifier."""
         if self._cf.is_called_by_incoming_handler_thread():
             raise UsageError("Parameters cannot be accessed from inside a cflib callback.")
         self._waiting = (channel, identifier)
@@ -102,7 +102,7 @@ class ParameterClient:
             self._waiting = None
 
     def _on_packet(self, packet: Any) -> None:
-        """In cflib's thread: must not raise, or cflib's own parameter thread dies."""
+        """Take a packet in cflib's thread; must not raise, or cflib's own parameter thread ends."""
         waiting = self._waiting
         if waiting is not None and packet.channel == waiting[0]:
             data = bytes(packet.data)
@@ -116,7 +116,7 @@ class ParameterClient:
         return element
 
     def _remember(self, element: Any, value: float | None) -> None:
-        """Keep cflib's own table of values (what get_value returns) in step with what we wrote."""
+        """Update cflib's own table of values (for its get_value) after a write."""
         group = self._cf.param.values.get(element.group)
         if group is not None and value is not None:
             group[element.name] = str(value)

@@ -1,4 +1,4 @@
-"""Bringing a lost link back without reading the tables again: they are the drone's, and it is the same drone."""
+"""Reconnection of a lost link without reading the tables again, because it is the same drone."""
 
 import contextlib
 import datetime
@@ -16,15 +16,15 @@ _TABLE_PORTS = (5, 2)  # ports: log, parameters
 _INFO = b"\x03"
 _ANSWER_WITHIN, _REPEAT_AFTER = 0.4, 0.1  # s
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.05, 0.8  # s between attempts
-_SAME_DRIVER_ATTEMPTS = 2  # attempts with the driver that is still there, before another takes its place
+_SAME_DRIVER_ATTEMPTS = 2  # attempts with the present driver, before a new one is made
 
 
 class Reconnector:
-    """Keeps what is needed to go on with a drone after its link was lost.
+    """Keeps the data for a reconnection to the same drone.
 
     Args:
         crazyflie: connected through `connection.connect`.
-        uri: where.
+        uri: address of the drone.
     """
 
     def __init__(self, crazyflie: Any, uri: str) -> None:
@@ -34,9 +34,9 @@ class Reconnector:
         self._described = dict(crazyflie.link.tables) if isinstance(crazyflie.link, RetryTransport) else {}
 
     def reconnect(self, blocks: LogBlocks, timeout: float, abort: threading.Event) -> int:
-        """Log data flows again when this returns, held back by `blocks`; returns how many blocks were created anew.
+        """Reconnect until log data arrive again (held by `blocks`); returns the number of blocks created again.
 
-        Raises: LinkError: not within `timeout` [s], or `abort` was set. AnotherDroneError: never will.
+        Raises: LinkError: not within `timeout` [s], or `abort` was set. AnotherDroneError: impossible.
         """
         deadline = time.monotonic() + timeout
         pause, attempt, why = _FIRST_PAUSE, 0, "nothing answers"
@@ -66,7 +66,7 @@ class Reconnector:
         return created
 
     def _another_driver(self) -> None:
-        """A fresh driver, and a fresh thread that reads from it: the old one may sleep for a second, or have died."""
+        """Make a new driver and a new reading thread: the old thread may sleep for a second, or have ended."""
         cf = self._cf
         from cflib.crazyflie import State
 
@@ -83,7 +83,7 @@ class Reconnector:
         cf.state = State.DISCONNECTED
         try:
             cf.link = new_driver(cf, self._uri)
-        except Exception as error:  # a driver may raise anything: the dongle may be out
+        except Exception as error:  # a driver may raise any error: the dongle may be unplugged
             raise LinkError(str(error) or type(error).__name__) from None
         shorten_socket_timeout(cf)
         cf.incoming.start()
@@ -97,7 +97,7 @@ class Reconnector:
                 raise AnotherDroneError(f"Another firmware answers at {self._uri} now: its tables differ.")
 
     def _restore(self) -> None:
-        """What cflib takes down when a driver reports an error."""
+        """Restore the data that cflib drops when a driver reports an error."""
         from cflib.crazyflie import State
 
         cf = self._cf

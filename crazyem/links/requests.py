@@ -1,10 +1,10 @@
-"""Requests to a Crazyflie and their replies: repeated while unanswered, each reply passed on once.
+"""Requests to a Crazyflie: repeated until a reply arrives; each reply is delivered once.
 
-cflib asks once and waits for ever, and over UDP nobody below it asks again. Asking again is not enough: two of its
-answers act whenever they come (the link's name and the protocol version begin the whole connection anew, and with it
-reset the log), so an answer that nobody waits for any more, as a link that repeats packets brings too, stops here.
+cflib sends a request once and waits for ever, and UDP does not repeat it. Repetition alone is not enough, because cflib
+acts on some answers at any time: the link's name and the protocol version restart the whole connection, which resets
+the log. So answers that are no longer expected, also duplicates by the link, are dropped here.
 
-High-level commands are among them: cflib sends a command to port 8 once and looks at no reply. The firmware answers
+The same holds for high-level commands: cflib sends a command to port 8 once and ignores the reply. The firmware answers
 each with its first byte, two more, and an error (crtp_commander_high_level.c).
 """
 
@@ -18,10 +18,10 @@ from typing import Any, TypeVar
 
 from crazyem.errors import UsageError
 
-_FIRST_TIMEOUT = 0.15  # s until the first repetition, while nothing is known about the round trip
+_FIRST_TIMEOUT = 0.15  # s until the first repetition, if the round trip is unknown
 _SHORTEST_TIMEOUT, _LONGEST_TIMEOUT = 0.03, 0.5  # s
-_TIMEOUT_DEVIATIONS = 4.0  # deviations of the round trip that a timeout adds to its mean
-_TIMEOUT_GROWTH = 1.7  # each repetition waits that much longer
+_TIMEOUT_DEVIATIONS = 4.0  # a timeout is the mean round trip plus so many deviations
+_TIMEOUT_GROWTH = 1.7  # factor on the timeout for each repetition
 
 _ITEM_V1, _ITEM, _INFO = 0, 2, 3
 _LOG_RESET = 5
@@ -34,12 +34,12 @@ Reply = TypeVar("Reply")
 def replies(
     ask: Callable[[], object], arrived: "queue.SimpleQueue[Reply]", *, timeout: float, repeat_after: float | None
 ) -> Iterator[Reply]:
-    """Each reply that arrives within `timeout` [s]; what arrived before the first question is thrown away.
+    """Yield each reply that arrives within `timeout` [s]; replies from before the first request are dropped.
 
     Args:
-        ask: send the request; False where nobody can be asked any more, which ends the waiting.
-        arrived: replies, from whichever thread.
-        repeat_after: s after which to ask again; None for what must not be done twice.
+        ask: sends the request; returns False if this is impossible, which ends the waiting.
+        arrived: replies, from any thread.
+        repeat_after: s after which the request is repeated; None if it must not be repeated.
     """
     while not arrived.empty():
         arrived.get_nowait()
@@ -70,7 +70,7 @@ def send(crazyflie: Any, port: int, channel: int, data: bytes) -> bool:
 
 
 def key_of(port: int, channel: int, data: bytes) -> Key | None:
-    """What a request and its reply have in common: port, channel and first bytes; None if it is not a request."""
+    """Key common to a request and its reply: port, channel and first bytes; None if it is not a request."""
     lengths = {(15, 1): 0, (13, 1): 1, (4, 1): 5, (2, 1): 2, (2, 3): 3}
     length = lengths.get((port, channel))
     if (port, channel) in _TOCS:
@@ -83,23 +83,23 @@ def key_of(port: int, channel: int, data: bytes) -> Key | None:
 
 
 def _acts_unrequested(key: Key) -> bool:
-    """Whether cflib acts on such an answer even if it comes unasked."""
+    """Whether cflib acts on such an answer even without a request."""
     port, channel, head = key
     return (port, channel) in ((15, 1), (13, 1), (4, 0), *_TOCS) or (port, channel, head) == (5, 1, b"\x05")
 
 
 class RetryTransport:
-    """A cflib driver that keeps account of requests; everything else is the driver's own.
+    """A wrapper of a cflib driver that tracks requests; everything else goes to the driver.
 
     Attributes:
-        tables: port (5 log, 2 parameters) -> the reply that described its table: count and checksum.
+        tables: port (5 log, 2 parameters) -> the reply that describes its table: count and checksum.
     """
 
     def __init__(self, driver: Any) -> None:
         self._driver = driver
         self._lock = threading.Lock()
         self._latest: tuple[Key, Any] | None = None  # the newest request
-        self._awaited: Key | None = None  # the newest request whose answer must come once only
+        self._awaited: Key | None = None  # the newest request whose answer must be delivered only once
         self._sent_at = 0.0
         self._repeated = 0
         self._round_trip = 0.0
@@ -110,7 +110,7 @@ class RetryTransport:
         return getattr(self._driver, name)
 
     def send_packet(self, packet: Any) -> Any:
-        """Hand a packet to the driver; a request is remembered as the newest."""
+        """Pass a packet to the driver; a request is stored as the newest."""
         key = key_of(packet.port, packet.channel, bytes(packet.data))
         if key is not None:
             with self._lock:
@@ -122,7 +122,7 @@ class RetryTransport:
         return self._driver.send_packet(packet)
 
     def receive_packet(self, wait: float = 0) -> Any:
-        """The next packet, None if there is none in time or it is an answer that nobody waits for."""
+        """The next packet, None if there is none in time or it is an unexpected answer."""
         packet = self._driver.receive_packet(wait)
         if packet is None or not self._passes(packet):
             return None
@@ -145,7 +145,7 @@ class RetryTransport:
         return True
 
     def _measure(self, round_trip: float) -> None:
-        """Smoothed round trip and its deviation, as TCP keeps them (RFC 6298)."""
+        """Update the smoothed round trip and its deviation, as in TCP (RFC 6298)."""
         if self._round_trip == 0.0:
             self._round_trip, self._deviation = round_trip, round_trip / 2
         else:
@@ -153,7 +153,7 @@ class RetryTransport:
             self._round_trip += 0.125 * (round_trip - self._round_trip)
 
     def due_retry(self) -> Any:
-        """The newest request if it is time to send it again (through the same Crazyflie object), else None."""
+        """The newest request if it is due for repetition (through the same Crazyflie object), else None."""
         with self._lock:
             if self._latest is None:
                 return None
@@ -165,7 +165,7 @@ class RetryTransport:
 
 
 class RequestClient:
-    """Asks one thing at a time; safe to use from any thread but cflib's own."""
+    """Client for one request at a time; may be used from any thread except cflib's own."""
 
     def __init__(self, crazyflie: Any) -> None:
         self._cf = crazyflie
@@ -181,11 +181,11 @@ class RequestClient:
     def request(
         self, port: int, channel: int, data: bytes, *, timeout: float, repeat_after: float | None
     ) -> bytes | None:
-        """The data of the reply that begins as its request does (`requests.key_of`), None if none came in time.
+        """The data of the reply with the same key as the request (`key_of`), None if none came in time.
 
         Args:
             timeout: s.
-            repeat_after: s without a reply after which to ask again; None for what must not be done twice.
+            repeat_after: s without a reply after which the request is repeated; None if it must not be repeated.
         """
         if self._cf.is_called_by_incoming_handler_thread():
             raise UsageError("The drone cannot be asked from inside a cflib callback.")
@@ -210,14 +210,14 @@ LAND_COMMAND = 8  # land2: group, height [m], yaw [rad], whether the present yaw
 
 
 def land_command(height: float, duration: float) -> bytes:
-    """Landing straight down to `height` [m, world] in `duration` [s], with the yaw it has."""
+    """Command to land straight down to `height` [m, world] in `duration` [s], with the present yaw."""
     return struct.pack("<BBff?f", LAND_COMMAND, 0, height, 0.0, True, duration)
 
 
 def send_until_confirmed(crazyflie: Any, command: bytes, *, timeout: float, repeat_after: float) -> bool:
-    """Whether the drone confirmed a command within `timeout` [s]; it is sent again every `repeat_after` [s].
+    """Send a command every `repeat_after` [s] until the drone confirms it; False if not within `timeout` [s].
 
-    For commands that may be carried out twice. Not to be called from a cflib callback.
+    For commands that may be carried out twice. Must not be called from a cflib callback.
     """
     errors: queue.SimpleQueue[int] = queue.SimpleQueue()
 

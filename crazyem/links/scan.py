@@ -1,7 +1,7 @@
-"""What is plugged in and what answers: radios, drones on USB, serial ports, UDP; and what stands in the way.
+"""Search for radios, drones on USB, serial ports and UDP, and for problems with them.
 
-Reads sysfs and udev's rules on Linux, and asks UDP ports with cflib's own probe. The air is searched only where there
-is a radio that may be used.
+The module reads sysfs and udev's rules on Linux, and tests UDP ports with cflib's own probe. It searches for drones by
+radio only if there is a usable radio.
 """
 
 import contextlib
@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 PROBE_PACKET = b"\xff"
-UDP_PORTS = tuple(range(19850, 19860))  # where cflib looks for simulated drones
+UDP_PORTS = tuple(range(19850, 19860))  # cflib's ports for simulated drones
 UDP_WAIT = 0.2  # s for all ports together
-_LARGEST_RULE = 1 << 20  # bytes of a file with udev rules that are looked at
+_LARGEST_RULE = 1 << 20  # bytes that are read of a file with udev rules
 
-# (vendor, product) -> what it is, and whether it is of any use as it is
+# (vendor, product) -> kind, and description with advice
 USB_DEVICES: dict[tuple[str, str], tuple[str, str]] = {
     ("1915", "7777"): ("radio", "Crazyradio"),
     ("1915", "0101"): ("bootloader", "Crazyradio in its bootloader (unplug it, or flash its firmware)"),
@@ -39,11 +39,11 @@ _RULE_FOLDERS = ("etc/udev/rules.d", "run/udev/rules.d", "usr/lib/udev/rules.d",
 
 @dataclass(frozen=True)
 class Found:
-    """One thing that is there.
+    """A device or drone that was found.
 
     Attributes:
-        uri: how to reach it, "" if it cannot be named so.
-        what: in words.
+        uri: its address, "" if it has none.
+        what: description.
         problem: why it cannot be used, "" if it can.
     """
 
@@ -54,7 +54,7 @@ class Found:
 
 @dataclass
 class Interface:
-    """One way to a drone: what was found, and what is missing (a sentence each, with the remedy)."""
+    """One kind of connection: what was found, and what is missing (one sentence each, with a remedy)."""
 
     name: str
     found: list[Found] = field(default_factory=list)
@@ -77,10 +77,10 @@ def scan(
     """Radio, USB, UDP and serial, in this order.
 
     Args:
-        host, ports: where simulated drones are looked for.
-        root: of the file system whose devices and rules are read (tests bring their own).
-        air: whether to search the air if there is a usable radio; takes some seconds.
-        search_air, serial_ports: what does that (default: cflib, pyserial).
+        host, ports: to search for simulated drones.
+        root: of the file system with devices and rules (for tests).
+        air: whether to search by radio if there is a usable one; takes some seconds.
+        search_air, serial_ports: functions for this (default: cflib, pyserial).
     """
     devices = usb_devices(root)
     rules = udev_vendors(root)
@@ -97,7 +97,7 @@ def scan(
 
 @dataclass(frozen=True)
 class Device:
-    """A USB device we know: kind, name, serial number, and whether this user may use it."""
+    """A known USB device: kind, name, serial number, and whether this user may use it."""
 
     kind: str
     name: str
@@ -107,7 +107,7 @@ class Device:
 
 
 def usb_devices(root: Path = Path("/")) -> list[Device]:
-    """Radios, drones and bootloaders on USB, from sysfs; empty where there is none."""
+    """Radios, drones and bootloaders on USB, from sysfs; empty without sysfs."""
     devices = []
     for folder in sorted(glob.glob(str(root / "sys/bus/usb/devices/*"))):
         path = Path(folder)
@@ -124,7 +124,7 @@ def usb_devices(root: Path = Path("/")) -> list[Device]:
 
 
 def _word(path: Path) -> str:
-    """First word-like line of a small sysfs file, without anything that could steer a terminal."""
+    """Text of a small sysfs file without control characters, at most 64 characters; "" if it cannot be read."""
     try:
         with path.open("rb") as file:
             text = file.read(128).decode("ascii", "replace").strip()
@@ -134,7 +134,7 @@ def _word(path: Path) -> str:
 
 
 def udev_vendors(root: Path = Path("/")) -> set[str]:
-    """USB vendors that some udev rule names together with rights for users."""
+    """USB vendors for which a udev rule gives rights to users."""
     vendors: set[str] = set()
     for folder in _RULE_FOLDERS:
         for name in sorted(glob.glob(str(root / folder / "*.rules"))):
@@ -163,7 +163,7 @@ def _rule_advice(rules: set[str]) -> list[str]:
 
 
 def _plugged(interface: Interface, devices: list[Device], loaders: list[Device], rules: set[str]) -> None:
-    """Lists what is plugged in, numbered as its address is."""
+    """Add plugged-in devices to the interface, with numbers as in their addresses."""
     for number, device in enumerate(devices):
         name = device.name + (f", serial {device.serial}" if device.serial else "")
         address = f"{interface.name}://{number}"
@@ -184,7 +184,7 @@ def _radio(devices: list[Device], rules: set[str], search: Callable[[], list[str
     elif radios and search is not None:
         try:
             uris = search()
-        except Exception as error:  # cflib and libusb raise whatever they like
+        except Exception as error:  # cflib and libusb may raise any error
             interface.missing.append(f"the air could not be searched: {error or type(error).__name__}")
         else:
             interface.found += [Found(uri, "a drone on the air") for uri in uris]
@@ -206,7 +206,7 @@ def _usb(devices: list[Device], rules: set[str]) -> Interface:
 
 
 def _search_air() -> list[str]:
-    """URIs of drones on their default address, every channel and rate, with the first radio (cflib, some seconds)."""
+    """URIs of drones at their default address on all channels and rates, by the first radio (cflib, some seconds)."""
     import io
 
     from crazyem.links.connection import quiet_cflib
@@ -214,7 +214,7 @@ def _search_air() -> list[str]:
     quiet_cflib()
     from cflib.crtp.radiodriver import RadioDriver
 
-    with contextlib.redirect_stdout(io.StringIO()) as said:  # it prints its errors
+    with contextlib.redirect_stdout(io.StringIO()) as said:  # cflib prints its errors
         found = RadioDriver().scan_interface(None)
     if not found and said.getvalue().strip():
         raise OSError(said.getvalue().strip().splitlines()[-1])
@@ -225,7 +225,7 @@ def _search_air() -> list[str]:
 
 
 def answering_ports(host: str, ports: Sequence[int], wait: float = UDP_WAIT) -> list[int]:
-    """Ports of a host that answer cflib's probe, all asked at once; a running session is not disturbed by it.
+    """Ports of a host that answer cflib's probe, tested at the same time; this does not disturb a running session.
 
     Raises: OSError: the host is unknown.
     """
@@ -244,7 +244,7 @@ def answering_ports(host: str, ports: Sequence[int], wait: float = UDP_WAIT) -> 
         while waiting and (left := deadline - time.monotonic()) > 0:
             for sock in select.select(list(waiting), [], [], left)[0]:
                 waiting.discard(sock)
-                with contextlib.suppress(OSError):  # refused: nobody listens there
+                with contextlib.suppress(OSError):  # refused: no program listens there
                     sock.recv(64)
                     answered.append(asked[sock])
     finally:
@@ -279,7 +279,7 @@ def _serial(list_ports: Callable[[], Sequence[Any]], root: Path) -> Interface:
     interface = Interface("serial")
     try:
         ports = sorted(list_ports(), key=lambda p: str(p.device))
-    except Exception as error:  # pyserial raises what the platform raises
+    except Exception as error:  # pyserial may raise any error of the platform
         interface.missing.append(f"serial ports could not be listed: {error}")
         return interface
     for port in ports:

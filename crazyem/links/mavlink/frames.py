@@ -1,6 +1,6 @@
-"""MAVLink 1 and 2 frames out of any bytes: found, checked, unpacked; and what their sequence numbers say of losses.
+"""MAVLink 1 and 2 frames in a stream of bytes: search, check and unpacking; and losses by their sequence numbers.
 
-pymavlink's definitions, not its parser: that one makes an object of every message, wanted or not, and raises on some
+The definitions come from pymavlink, but not the parser, which makes an object of every message and raises on some
 bytes. Source: mavlink.io/en/guide/serialization.html.
 """
 
@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 FRAME_MARKS = _V1, _V2 = 0xFE, 0xFD
 _SIGNED, _SIGNATURE = 1, 13
-_LARGEST_BUFFER = 4096  # bytes that may wait for the rest of their frame; a frame has at most 280
+_LARGEST_BUFFER = 4096  # bytes of incomplete frames; a frame has at most 280
 _REVERSED_BITS = bytes(int(f"{i:08b}"[::-1], 2) for i in range(256))
 
 
@@ -39,7 +39,7 @@ def _definitions() -> dict[int, Definition]:
         arrays = message.array_lengths
         fields = tuple((name, n if a and n else 0) for name, n, a in zip(message.ordered_fieldnames, counts, arrays))
         found[number] = Definition(message.msgname, number, message.crc_extra, message.unpacker, fields)
-    # in MAVLink's common.xml, but left out of pymavlink 2.4.50
+    # in MAVLink's common.xml, but not in pymavlink 2.4.50
     four = (("time_usec", 0), ("rpm", 4), ("voltage", 4), ("current", 4), ("index", 0))
     found.setdefault(291, Definition("ESC_STATUS", 291, 10, struct.Struct("<Q4i4f4fB"), four))
     return found
@@ -63,15 +63,15 @@ def number_of(name: str) -> int:
 
 
 def checksum(data: bytes) -> int:
-    """CRC-16/MCRF4XX: the reflected twin of the CCITT polynomial that binascii has in C."""
+    """CRC-16/MCRF4XX, the reflected form of binascii's CRC-CCITT (which is fast)."""
     straight = binascii.crc_hqx(data.translate(_REVERSED_BITS), 0xFFFF)
     return _REVERSED_BITS[straight & 0xFF] << 8 | _REVERSED_BITS[straight >> 8]
 
 
 def header(data: bytes, at: int) -> tuple[int, int, int, int, int, int, int] | None:
-    """Sequence, system, component, message; where the payload begins and ends, and where the frame at `at` ends.
+    """Sequence, system, component, message; begin and end of the payload, and end of the frame at `at`.
 
-    None where no frame begins that is known here, or the data end within its head.
+    None if no known kind of frame begins there, or its head is incomplete.
     """
     head = 10 if data[at] == _V2 else 6
     if data[at] not in FRAME_MARKS or len(data) - at < head:
@@ -81,20 +81,20 @@ def header(data: bytes, at: int) -> tuple[int, int, int, int, int, int, int] | N
         number = int.from_bytes(data[at + 7 : at + 10], "little")
     else:
         flags, (sequence, system, component, number) = 0, data[at + 2 : at + 6]
-    if flags & ~_SIGNED:  # incompatible with what we know
+    if flags & ~_SIGNED:  # unknown incompatibility flags
         return None
     end = at + head + data[at + 1]
     return sequence, system, component, number, at + head, end, end + 2 + (_SIGNATURE if flags else 0)
 
 
 def is_sound(data: bytes, at: int, end: int, seed: int) -> bool:
-    """Whether the checksum behind the payload that ends at `end` is that of the frame at `at`."""
+    """Whether the checksum after the payload (end: `end`) is right for the frame at `at`."""
     return checksum(data[at + 1 : end] + bytes((seed,))) == data[end] | data[end + 1] << 8
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A sound frame; `raw` is all of it, signature included (which is not verified: we hold no key)."""
+    """A frame with a right checksum; `raw` is the whole frame with its signature (not verified: we have no key)."""
 
     system: int
     component: int
@@ -108,7 +108,7 @@ class Frame:
         return definitions()[self.message].name
 
     def fields(self) -> dict[str, Any]:
-        """Field -> number, tuple of numbers or bytes; what MAVLink 2 cut off the end is zero."""
+        """Field -> number, tuple of numbers or bytes; fields that MAVLink 2 cut off at the end are zero."""
         d = definitions()[self.message]
         size = d.unpacker.size
         values = d.unpacker.unpack(self.payload[:size].ljust(size, b"\0"))
@@ -121,11 +121,11 @@ class Frame:
 
 
 class FrameParser:
-    """Feed it bytes as they come; bounded memory whatever they are.
+    """Parser of a stream of bytes with bounded memory.
 
     Attributes:
-        damaged: frames of known kind and wrong checksum. unknown: frames of kinds without definition, skipped.
-        skipped: bytes that belong to no frame.
+        damaged: number of frames of a known kind with a wrong checksum. unknown: number of frames without a definition.
+        skipped: number of bytes outside frames.
     """
 
     def __init__(self) -> None:
@@ -133,7 +133,7 @@ class FrameParser:
         self.damaged = self.unknown = self.skipped = 0
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Sound frames that are complete now, in order."""
+        """Complete frames with a right checksum, in order."""
         data = self._buffer + data
         found: list[Frame] = []
         at = 0
@@ -145,13 +145,13 @@ class FrameParser:
                 break
             step = self._take(data, at, found)
             if step == 0:
-                break  # more is to come
+                break  # the frame is incomplete
             at += step
         self._buffer = data[at:][-_LARGEST_BUFFER:]
         return found
 
     def _take(self, data: bytes, at: int, found: list[Frame]) -> int:
-        """Bytes to go on by; 0: the frame that begins here is not complete."""
+        """Number of bytes to skip; 0: the frame that begins here is incomplete."""
         if len(data) - at < (10 if data[at] == _V2 else 6):
             return 0
         head = header(data, at)
@@ -171,24 +171,24 @@ class FrameParser:
         if not is_sound(data, at, end, definition.seed):
             self.damaged += 1
             self.skipped += 1
-            return 1  # a frame may begin inside of what was taken for one
+            return 1  # another frame may begin inside the damaged one
         found.append(Frame(system, component, number, sequence, data[start:end], data[at:after]))
         return after - at
 
 
 def _mark(data: bytes, at: int) -> int:
-    """The next place where a frame may begin, len(data) if there is none."""
+    """The next position at which a frame may begin, len(data) if there is none."""
     places = [p for p in (data.find(b"\xfd", at), data.find(b"\xfe", at)) if p >= 0]
     return min(places, default=len(data))
 
 
-_REPEAT_MEMORY = 64  # newest frames that a repetition is recognised among
-_LATE_NUMBERS = 128  # numbers behind count as late, numbers ahead as a gap
+_REPEAT_MEMORY = 64  # newest frames in which repetitions are recognised
+_LATE_NUMBERS = 128  # up to so many numbers ahead are a gap, else the frame is late
 _MODULUS = 256
 
 
 class SequenceCounter:
-    """Attributes: received, lost (at least: 256 lost in a row look like none), late, repeated."""
+    """Counts of frames by sequence numbers: received, lost (at least: 256 in a row look like none), late, repeated."""
 
     def __init__(self) -> None:
         self.received = self.lost = self.late = self.repeated = 0
@@ -197,7 +197,7 @@ class SequenceCounter:
         self._seen: deque[bytes] = deque(maxlen=_REPEAT_MEMORY)
 
     def take(self, sequence: int, raw: bytes) -> bool:
-        """Account for a frame; False: it was here before, drop it."""
+        """Count a frame; False: a repetition, to be dropped."""
         if raw in self._seen:
             self.repeated += 1
             return False
@@ -214,10 +214,10 @@ class SequenceCounter:
             self._missing = (
                 {n for n in self._missing if n > self._newest - _LATE_NUMBERS} if self._missing else self._missing
             )
-        elif ahead:  # 0: 256 lost, or a sender that does not count
+        elif ahead:  # 0: 256 lost, or a sender without sequence numbers
             self.late += 1
             number = self._newest + ahead - _MODULUS
-            if number in self._missing:  # else it is a repetition whose first arrival is forgotten
+            if number in self._missing:  # else an old repetition
                 self._missing.remove(number)
                 self.lost -= 1
         return True

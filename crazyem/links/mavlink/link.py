@@ -1,6 +1,6 @@
-"""A drone that speaks MAVLink, as a Link: watched, timed, its losses counted, one of its parameters written if asked.
+"""A link to a MAVLink drone: it receives messages, relates clocks, counts losses, and can write a parameter.
 
-It cannot be flown from here: setpoints of an autopilot belong to whoever flies it.
+It cannot fly the drone: setpoints belong to the program that flies it.
 """
 
 import queue
@@ -19,10 +19,10 @@ from crazyem.links.mavlink.sender import ACCEPTED, MessageSender
 from crazyem.links.mavlink.transport import open_transport, parse
 from crazyem.signals.sample import Block, Packet
 
-# s of listening after streams were asked for; at most, if something is missing
+# s of listening after the request for streams; the same at most, if messages are missing
 _LISTEN_SECONDS, _LONGEST_LISTEN_SECONDS = 0.7, 5.0
 HOVER_PARAMETERS = {motors.PX4: "MPC_THR_HOVER", motors.ARDUPILOT: "MOT_THST_HOVER"}
-# another estimator on board that writes the same: parameter, the value that means it is on, what it does
+# onboard estimator of hover thrust: its parameter, the value if it is on, a description
 ONBOARD_HOVER_ESTIMATORS = {
     motors.PX4: ("MPC_USE_HTE", 1.0, "PX4 flies with its own estimate of hover thrust"),
     motors.ARDUPILOT: ("MOT_HOVER_LEARN", 2.0, "ArduPilot learns and saves hover thrust itself"),
@@ -30,15 +30,15 @@ ONBOARD_HOVER_ESTIMATORS = {
 
 
 class MavlinkLink:
-    """One autopilot. Blocks are messages (`streams`); every call has a time limit, none waits for ever.
+    """A link to one autopilot. Blocks are messages (`streams`); every call has a time limit.
 
     Args:
-        uri: see `address.parse`. Raises UsageError.
+        uri: see `transport.parse`. Raises UsageError.
 
     Attributes:
         packets: received, in order; `LinkLost` at the end.
-        on_frame: called with (host time [s], frame) for every sound frame of this drone, in the receiving thread.
-        outputs: how its motors are read.
+        on_frame: called with (host time [s], frame) for every valid frame of this drone, in the receiving thread.
+        outputs: mapping of its motor outputs.
     """
 
     def __init__(self, uri: str) -> None:
@@ -59,7 +59,7 @@ class MavlinkLink:
     # --- connection ---------------------------------------------------------------------------------------------
 
     def connect(self, timeout: float = 30.0) -> None:
-        """Wait for the heartbeat of a vehicle, then ask what its outputs mean. Raises LinkError."""
+        """Wait for the heartbeat of a vehicle, then read the parameters of its outputs. Raises LinkError."""
         if self._receiver is not None:
             return
         self._receiver = receiver = Receiver(
@@ -87,7 +87,7 @@ class MavlinkLink:
         wanted = [*motors.wanted(receiver.autopilot), *self._hover_names()]
 
         def complete() -> bool:
-            version = attempt > 0 or "AUTOPILOT_VERSION" in receiver.seen  # not all have one
+            version = attempt > 0 or "AUTOPILOT_VERSION" in receiver.seen  # not all autopilots send one
             return version and not set(wanted) - self._parameters.known.keys()
 
         for attempt in range(3):
@@ -104,7 +104,7 @@ class MavlinkLink:
         return [n for n in (name, own[0] if own else None) if n]
 
     def close(self) -> None:
-        """Stop listening and close the wire. What streams were asked for goes on."""
+        """Stop listening and close the connection. The requested streams go on."""
         receiver, self._receiver = self._receiver, None
         if receiver is not None:
             receiver.close()
@@ -144,7 +144,7 @@ class MavlinkLink:
 
     @property
     def simulated(self) -> bool:
-        """Whether it calls itself our simulator. An address says nothing: real drones are relayed to this host too."""
+        """Whether the drone says that it is our simulator; an address is no evidence, since it may be a relay."""
         return self._receiver is not None and self._receiver.simulated
 
     @property
@@ -159,13 +159,13 @@ class MavlinkLink:
 
     @property
     def log_variables(self) -> Mapping[str, str]:
-        """Name -> C type of every variable a block of ours can have."""
+        """Name -> C type of every variable in our blocks."""
         return {v.name: v.ctype for name in streams.block_names() for v in streams.variables_of(name)}
 
     def start_streams(self, rate_hz: float) -> tuple[Block, ...]:
-        """Ask for all that the estimator needs, see what comes, and let it flow as blocks.
+        """Request all messages for the estimator, select from those that arrive, and deliver them as blocks.
 
-        Raises: LinkError: position, attitude or the work of the motors does not come.
+        Raises: LinkError: no messages with position, attitude, or motor outputs or rotor speeds.
         """
         receiver = self._open()
         self._rate = rate_hz
@@ -183,7 +183,7 @@ class MavlinkLink:
         return tuple(blocks.values())
 
     def subscribe(self, variables: Sequence[str], rate_hz: float) -> tuple[Block, ...]:
-        """All streams at once, whatever the variables: an autopilot sends messages, not variables."""
+        """Start all streams for any variables: an autopilot sends messages, not variables."""
         unknown = [v for v in variables if v not in self.log_variables]
         if unknown:
             raise UsageError(f"a MAVLink drone has no log variable {unknown[0]}.")
@@ -197,32 +197,32 @@ class MavlinkLink:
                 result = sender.set_interval(number_of(name), hertz)
                 answers += result == ACCEPTED
                 if result is None and not answers:
-                    break  # it does not know the command; do not ask twelve times
+                    break  # the command is unknown: do not repeat it for all messages
         if not answers:
             for group, fast in streams.STREAM_GROUPS:
                 sender.request_stream(group, rate_hz if fast else min(streams.SLOW_HZ, rate_hz))
 
     def statistics(self) -> LinkStatistics:
-        """Messages of this drone by fate: lost by their sequence numbers, repeated ones not counted."""
+        """Counts of this drone's messages: lost ones by their sequence numbers, without repeated ones."""
         return self._open().statistics()
 
     def clock(self) -> ClockFit | None:
-        """How the host clock runs against the autopilot's, None before the first packet."""
+        """Relation of the host clock to the autopilot's, None before the first packet."""
         return self._open().fit()
 
     def account(self) -> Mapping[str, str]:
-        """What became of the bytes, for the end of a recording."""
+        """Counts of frames and bytes, for the end of a recording."""
         return self._open().account()
 
     # --- the end of a link --------------------------------------------------------------------------------------
 
     @property
     def can_reconnect(self) -> bool:
-        """Whether `reconnect` may bring a lost link back."""
+        """Whether `reconnect` may succeed."""
         return self._receiver is not None and not self._receiver.unrecoverable
 
     def reconnect(self, timeout: float = 5.0, abort: threading.Event | None = None) -> Outage:
-        """After a `LinkLost`: wait for the same drone, whose clock must have gone on; ask for its streams again.
+        """After a `LinkLost`: wait for the same drone with a continuous clock, and request its streams again.
 
         Raises: LinkError: not in time, or restarted.
         """
@@ -248,7 +248,7 @@ class MavlinkLink:
         return Outage(reason, receiver.last - since, before, receiver.drone_clock.newest_ms, 0)
 
     def _reopen(self, receiver: Receiver) -> None:
-        """A serial port that was unplugged has to be opened anew."""
+        """Open the transport again, for example after a serial port was unplugged."""
         try:
             transport = open_transport(self.address)
         except LinkError:
@@ -261,33 +261,33 @@ class MavlinkLink:
 
     @property
     def parameters(self) -> Mapping[str, str]:
-        """Name -> C type of the parameters heard of so far: the whole list takes minutes over a telemetry radio."""
+        """Name -> C type of the parameters received so far: the whole list takes minutes over a telemetry radio."""
         return self._parameters.types()
 
     @property
     def parameter_fault(self) -> str:
-        """Why the last parameter access went unanswered; "" while parameters work."""
+        """Why the last parameter access had no answer; "" if parameters work."""
         return self._parameters.fault
 
     @property
     def hover_parameter(self) -> str:
-        """The hover thrust parameter of this kind of autopilot, "" if it has none that we know."""
+        """The hover thrust parameter of this kind of autopilot, "" if none is known."""
         return HOVER_PARAMETERS.get(self.autopilot, "")
 
     @property
     def onboard_hover_estimator(self) -> str:
-        """What on board writes or replaces the same parameter, one clause; "" if nothing does."""
+        """The onboard estimator that writes or replaces this parameter, one clause; "" if there is none."""
         name, value, what = ONBOARD_HOVER_ESTIMATORS.get(self.autopilot, ("", 0.0, ""))
         return f"{what} ({name} = {value:g})" if self._parameters.known.get(name) == value else ""
 
     @property
     def cells(self) -> int:
-        """Of the battery; 0 while unknown."""
+        """Number of battery cells; 0 if unknown."""
         return self._open().streams.cells
 
     @property
     def about(self) -> Mapping[str, Mapping[str, str]]:
-        """For recordings: sections "mavlink" and "parameter_values" (those read)."""
+        """Description for recordings: sections "mavlink" and "parameter_values" (received ones)."""
         receiver = self._open()
         link = {
             "system": str(receiver.system),
@@ -302,7 +302,7 @@ class MavlinkLink:
         return {"mavlink": link, "parameter_values": {n: repr(v) for n, v in self._parameters.known.items()}}
 
     def read_parameter(self, name: str, timeout: float = 2.0) -> float:
-        """The value in the drone now. Raises LinkError or UsageError."""
+        """The present value in the drone. Raises LinkError or UsageError."""
         self._talk()
         return self._parameters.read(name, timeout)
 
@@ -311,7 +311,7 @@ class MavlinkLink:
         self._talk()
         return self._parameters.write(name, value, timeout)
 
-    # --- flying: not from here ----------------------------------------------------------------------------------
+    # --- flying: not possible -----------------------------------------------------------------------------------
 
     def _not_flown(self, *_: object, **__: object) -> None:
         raise UsageError("a MAVLink drone is watched, not flown: fly it with its own ground station.")
@@ -322,7 +322,7 @@ class MavlinkLink:
 
 
 def _missing(seen: Mapping[str, int]) -> list[str]:
-    """What the estimator cannot do without and has not come."""
+    """Necessary inputs of the estimator that have not arrived."""
     needs = {
         "LOCAL_POSITION_NED (has it no position?)": ("LOCAL_POSITION_NED",),
         "attitude": ("ATTITUDE_QUATERNION", "ATTITUDE"),

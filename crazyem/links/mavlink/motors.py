@@ -1,4 +1,4 @@
-"""Which output channel drives which of our rotors, and what its numbers mean: from the autopilot's parameters.
+"""Mapping from output channels to our rotors, and the scale of their values, from the autopilot's parameters.
 
 Our rotors: 1 front right, 2 back right, 3 back left, 4 front left, 1 and 3 counter-clockwise. PX4's and ArduPilot's
 motors of an X quad: 1 front right, 2 back left, 3 front left, 4 back right, 1 and 2 counter-clockwise.
@@ -16,7 +16,7 @@ PX4, ARDUPILOT = 12, 3  # MAV_AUTOPILOT
 
 
 def wanted(autopilot: int) -> tuple[str, ...]:
-    """Parameters that `Outputs.of` makes use of."""
+    """Names of the parameters that `Outputs.of` uses."""
     if autopilot == PX4:
         bank = [f"PWM_MAIN_{what}{n}" for what in ("FUNC", "MIN", "MAX") for n in range(1, 5)]
         return (*bank, *(f"CA_ROTOR{n}_P{axis}" for n in range(4) for axis in "XY"))
@@ -27,12 +27,12 @@ def wanted(autopilot: int) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """How to read outputs and rotor speeds.
+    """Mapping of output channels and rotor speeds to our rotors.
 
     Attributes:
-        channels: of our rotors 1..4: index of the output channel. motors: of them: index of the autopilot's motor.
+        channels: index of the output channel of our rotors 1..4. motors: index of the autopilot's motor, likewise.
         least, most: us of each channel 0..3 at no and at full thrust.
-        assumed: what was assumed because no parameter said so.
+        assumed: assumptions in place of missing parameters.
     """
 
     channels: tuple[int, int, int, int] = OUR_ROTOR_PLACES
@@ -43,7 +43,7 @@ class Outputs:
 
     @classmethod
     def of(cls, autopilot: int, parameters: Mapping[str, float]) -> "Outputs":
-        """From what the autopilot says of itself; what it does not say is as usual for an X quad."""
+        """The mapping from the autopilot's parameters; without a parameter, the usual value of an X quad."""
         assumed = []
         motors = _by_place(parameters)
         if motors is None:
@@ -66,9 +66,9 @@ class Outputs:
         return cls((a, b, c, d), motors, tuple(low), tuple(high), tuple(assumed))
 
     def duty(self, values: Sequence[float]) -> tuple[float, float, float, float] | None:
-        """Shares 0..1 of full thrust command of our rotors, from the first outputs as sent; None: not to be read.
+        """Shares 0..1 of the full thrust command of our rotors, from the first outputs as sent; None if invalid.
 
-        Numbers within -1..1 are shares already (negative: reversed or stopped, 0 here), all else pulses in us.
+        Numbers within -1..1 are shares (negative: reversed or stopped, 0 here); other numbers are pulses in us.
         """
         used = [float(values[i]) for i in self.channels]
         if not all(math.isfinite(v) for v in used):
@@ -86,13 +86,13 @@ class Outputs:
         return a, b, c, d
 
     def speeds(self, rpm: Sequence[float]) -> tuple[float, float, float, float]:
-        """rpm of our rotors 1..4 from those of the autopilot's motors; their sense does not matter."""
+        """Speeds [rpm] of our rotors 1..4 from those of the autopilot's motors, without sign."""
         a, b, c, d = (abs(float(rpm[i])) for i in self.motors)
         return a, b, c, d
 
 
 def _by_place(parameters: Mapping[str, float]) -> tuple[int, int, int, int] | None:
-    """Motors by the signs of their places (x forward, y right), None unless there is one in each corner."""
+    """Motors by the signs of their positions (x forward, y right); None unless each corner has one."""
     corners: dict[tuple[bool, bool], int] = {}
     for n in range(4):
         x, y = (parameters.get(f"CA_ROTOR{n}_P{axis}", 0.0) for axis in "XY")

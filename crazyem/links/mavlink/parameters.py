@@ -1,6 +1,6 @@
-"""The parameter protocol: one value read or written at a time, asked for again while no answer comes.
+"""The parameter protocol: reads and writes one value at a time, and repeats requests without an answer.
 
-Values travel as floats: PX4 sends the bits of an integer in them, ArduPilot its value.
+Values are sent as floats: PX4 sends the bits of an integer in a float, ArduPilot converts its value to a float.
 Source: mavlink.io/en/services/parameter.html.
 """
 
@@ -23,7 +23,7 @@ _REAL32 = 9
 
 
 def decode(value: float, kind: int, *, bitwise: bool) -> float:
-    """What a PARAM_VALUE means; NaN for a type that does not fit into a float."""
+    """The value in a PARAM_VALUE; NaN for a type that does not fit into a float."""
     if kind not in PARAMETER_TYPES:
         return float("nan")
     if kind == _REAL32 or not bitwise:
@@ -33,7 +33,7 @@ def decode(value: float, kind: int, *, bitwise: bool) -> float:
 
 
 def encode(value: float, kind: int, *, bitwise: bool) -> float:
-    """The float that carries a value in a PARAM_SET. Raises UsageError if the type cannot hold it."""
+    """The float for a value in a PARAM_SET. Raises UsageError if the type cannot hold the value."""
     name, form = PARAMETER_TYPES.get(kind, ("unknown", ""))
     try:
         if kind == _REAL32:
@@ -47,12 +47,12 @@ def encode(value: float, kind: int, *, bitwise: bool) -> float:
 
 
 class ParameterClient:
-    """`read` and `write` send requests; the receiving thread hands in answers through `on_value`.
+    """Client for parameters: `read` and `write` send requests; the receiving thread passes answers to `on_value`.
 
     Args:
         uri: for messages.
-        ask_read, ask_write: send PARAM_REQUEST_READ of a name; PARAM_SET of a name, float and type.
-        bitwise: whether integers travel as bits (PX4).
+        ask_read: sends PARAM_REQUEST_READ of a name. ask_write: sends PARAM_SET of a name, float and type.
+        bitwise: whether integers are sent as bits (PX4).
     """
 
     def __init__(
@@ -72,17 +72,17 @@ class ParameterClient:
 
     @property
     def known(self) -> Mapping[str, float]:
-        """Every value heard so far."""
+        """All values received so far."""
         return {name: decode(v, kind, bitwise=self._bitwise()) for name, (v, kind) in dict(self._known).items()}
 
     def types(self) -> Mapping[str, str]:
-        """C type of every parameter heard of."""
+        """C type of every parameter received so far."""
         return {
             name: PARAMETER_TYPES[kind][0] for name, (_, kind) in dict(self._known).items() if kind in PARAMETER_TYPES
         }
 
     def on_value(self, fields: Mapping[str, Any]) -> None:
-        """A PARAM_VALUE has come."""
+        """Take a received PARAM_VALUE."""
         name = bytes(fields["param_id"]).split(b"\0")[0].decode("ascii", "replace")
         value, kind = float(fields["param_value"]), int(fields["param_type"])
         if len(self._known) < 5000 or name in self._known:
@@ -91,7 +91,7 @@ class ParameterClient:
             self._replies.put((value, kind))
 
     def read(self, name: str, timeout: float) -> float:
-        """The value in the drone now. Raises LinkError: no answer (some autopilots do not answer for unknown names)."""
+        """The present value in the drone. Raises LinkError: no answer (some autopilots ignore unknown names)."""
         with self._lock:
             for value, kind in self._replies_to(name, lambda: self._ask_read(name), timeout):
                 self.fault = ""
@@ -100,7 +100,7 @@ class ParameterClient:
         raise LinkError(self.fault)
 
     def write(self, name: str, value: float, timeout: float) -> ParameterWrite:
-        """Write and wait for the echo: `verified` only if the drone sent back exactly the bits written.
+        """Write and wait for the echo: `verified` only if the drone sends back exactly the written bits.
 
         Raises: UsageError: unknown parameter, or its type cannot hold the value.
         """
@@ -125,7 +125,7 @@ class ParameterClient:
         return ParameterWrite(name, value, echoed, False, time.time())
 
     def _replies_to(self, name: str, request: Callable[[], object], timeout: float) -> Iterator[tuple[float, int]]:
-        """Ask until the deadline, yielding each answer for the name."""
+        """Repeat the request until the deadline, and yield each answer for the name."""
         if not name or len(name) > 16 or not name.isascii():
             raise UsageError(f'"{name[:40]}" is no name of a MAVLink parameter.')
         self._waiting = name

@@ -1,6 +1,6 @@
-"""The receiving half of a MAVLink link: frames in, the drone chosen, stamped, counted, turned into packets of blocks.
+"""The receiver of a MAVLink link: it selects a drone, counts its frames, and turns them into packets of blocks.
 
-One thread; it also says our heartbeats and asks for the time, since it wakes up often enough.
+One thread, which also sends our heartbeats and requests for the time, because it wakes up often enough.
 """
 
 import math
@@ -32,22 +32,23 @@ OUR_SIMULATOR = b"crazyem firmware"  # begins AUTOPILOT_VERSION.uid2 of firmware
 
 
 class Receiver:
-    """Everything that is heard.
+    """Receives the messages of one selected drone.
 
     Args:
-        uri: for messages. sender: its transport is listened to. system: the one to choose, None: the first heard.
-        packets: where packets of blocks go, and `LinkLost` at the end.
-        on_parameter: told each PARAM_VALUE.
+        uri: for messages. sender: owner of the transport. system: number of the drone, None: the first one received.
+        packets: queue for packets of blocks, and `LinkLost` at the end.
+        on_parameter: called with each PARAM_VALUE.
 
     Attributes:
-        autopilot, kind: MAV_AUTOPILOT and MAV_TYPE of the chosen, -1 before. system, component: its numbers.
-        simulated: whether it calls itself our simulator.
-        seen: messages of it so far, by name. foreign: frames of other systems, by number.
-        refused: values that were none: NaN, masked, out of range.
-        on_frame: called with (host time [s], frame) for every sound frame of the chosen one.
-        blocks: what becomes packets. lost: why the link counts as lost, "". unrecoverable: there is no coming back.
-        unplugged: the transport is gone and has to be opened anew.
-        last: when it was last heard, of time.monotonic().
+        autopilot, kind: MAV_AUTOPILOT and MAV_TYPE of the drone, -1 before it is selected.
+        system, component: numbers of the drone.
+        simulated: whether the drone says that it is our simulator.
+        seen: number of its messages, by name. foreign: number of frames of other systems, by system.
+        refused: number of invalid values: NaN, masked, out of range.
+        on_frame: called with (host time [s], frame) for every valid frame of the drone.
+        blocks: those that become packets. lost: why the link counts as lost, or "". unrecoverable: the drone restarted.
+        unplugged: the transport is gone and has to be opened again.
+        last: time.monotonic() of the last values.
     """
 
     def __init__(
@@ -87,25 +88,25 @@ class Receiver:
         self._thread.start()
 
     def use(self, blocks: dict[str, Block]) -> None:
-        """From now on these become packets."""
+        """Deliver packets of these blocks from now on."""
         with self._lock:
             self._received = {b.identifier: 0 for b in blocks.values()}
             self.blocks = blocks
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop the thread."""
         self._stop.set()
         if self._thread is not threading.current_thread():
             self._thread.join(timeout=2.0)
 
     def end_outage(self) -> None:
-        """The link is there again."""
+        """Note that the link is back."""
         with self._lock:
             self.lost = ""
             self.outages += 1
 
     def statistics(self) -> LinkStatistics:
-        """Messages of this drone by fate: lost by their sequence numbers, repeated ones not counted."""
+        """Counts of this drone's messages: lost ones by their sequence numbers, without repeated ones."""
         trips = list(self._round_trips)
         with self._lock:
             fit = self.relation.fit()
@@ -123,7 +124,7 @@ class Receiver:
         )
 
     def account(self) -> Mapping[str, str]:
-        """What became of the bytes, for the end of a recording."""
+        """Counts of frames and bytes, for the end of a recording."""
         return {
             "repeated": str(self.sequence.repeated),
             "damaged": str(self.parser.damaged),
@@ -134,14 +135,14 @@ class Receiver:
         }
 
     def fit(self) -> ClockFit | None:
-        """How the host clock runs against the autopilot's, None before the first packet."""
+        """Relation of the host clock to the autopilot's, None before the first packet."""
         with self._lock:
             return self.relation.fit()
 
     def _run(self) -> None:
         try:
             self._listen()
-        except Exception as error:  # a fault of ours must reach whoever flies, not only a log
+        except Exception as error:  # an internal error must be reported as a lost link
             self._report_lost(f"Receiving from {self.uri} failed: {error!r}.")
 
     def _listen(self) -> None:
@@ -169,7 +170,7 @@ class Receiver:
                 self._stop.wait(0.1)
                 continue
             if self._peer is not None and peer is not None and peer != self._peer:
-                continue  # somebody else: whoever began is whom we talk to
+                continue  # from another address than the selected drone
             for frame in self.parser.feed(data) if data else ():
                 self._frame(sender, frame, peer)
 
@@ -183,7 +184,7 @@ class Receiver:
                 self.foreign[frame.system] = self.foreign.get(frame.system, 0) + 1
             return
         if frame.component != self.component:
-            return  # a camera or a gimbal of the same drone counts for itself
+            return  # a camera or a gimbal has its own sequence numbers
         if not self.sequence.take(frame.sequence, frame.raw):
             return
         host_time = time.time()
@@ -192,7 +193,7 @@ class Receiver:
         self._message(sender, frame, host_time)
 
     def _consider(self, sender: MessageSender, frame: Frame, peer: Peer) -> None:
-        """Whether this is the heartbeat of the vehicle that is to be watched."""
+        """Select the drone if this is a heartbeat of a vehicle (with the wanted number)."""
         fields = frame.fields() if frame.name == "HEARTBEAT" else None
         wanted = self._wanted
         vehicle = fields and fields["autopilot"] != _NO_AUTOPILOT and fields["type"] not in _NOT_A_VEHICLE
@@ -226,7 +227,7 @@ class Receiver:
             sender.answer_time(int(fields["ts1"]))
             return
         took = (time.monotonic_ns() - int(fields["ts1"])) / 1e9
-        if 0.0 <= took < 10.0:  # else it is somebody else's
+        if 0.0 <= took < 10.0:  # else the answer to another client
             self._round_trips.append(took)
 
     def _values(self, name: str, fields: Mapping[str, Any], host_time: float) -> None:

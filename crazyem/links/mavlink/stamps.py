@@ -1,33 +1,33 @@
-"""The autopilot's clock from the stamps of its messages: milliseconds since boot, unwrapped, guarded against nonsense.
+"""The autopilot's clock from the stamps of its messages: milliseconds since boot, unwrapped and checked.
 
-Messages stamp ms since boot (32 bits), us since boot (64 or 32 bits), us since 1970, or nothing. Sources:
-mavlink.io/en/messages/common.html; PX4 cuts its microseconds down to time_boot_ms, so microseconds are cut here too.
+Messages have stamps in ms since boot (32 bits), us since boot (64 or 32 bits), us since 1970, or none. Sources:
+mavlink.io/en/messages/common.html. PX4 truncates microseconds to time_boot_ms, so microseconds are truncated here, too.
 """
 
 import math
 from collections.abc import Mapping
 from typing import Any
 
-EPOCH_US = 10**15  # a time_usec beyond is since 1970
-_BEHIND_MS = 2000.0  # stamps older than the newest by more are of another life
+EPOCH_US = 10**15  # us; a larger time_usec is since 1970
+_BEHIND_MS = 2000.0  # ms; stamps further behind the newest one are refused
 _AHEAD_MS, _FASTEST_CLOCK_RATIO = (
     2000.0,
     100.0,
-)  # stamps may run ahead by that much, and be that many times faster than the host
-_RESTART_REFUSALS = 20  # stamps out of place in a row that make a restart
+)  # ms; largest lead of a stamp, in addition to this factor times the host's elapsed time
+_RESTART_REFUSALS = 20  # refused stamps in a row that mean a restart
 _WRAP32 = 1 << 32
 
 
 class RestartedError(Exception):
-    """The autopilot's clock has begun anew."""
+    """The autopilot's clock has restarted."""
 
 
 class DroneClock:
     """Places messages on the drone's clock.
 
     Attributes:
-        newest_ms: newest stamp taken; NaN before the first.
-        refused: stamps that were not believed.
+        newest_ms: newest accepted stamp; NaN before the first.
+        refused: number of refused stamps.
     """
 
     def __init__(self) -> None:
@@ -38,11 +38,11 @@ class DroneClock:
         self._refused_in_row = 0
 
     def place(self, fields: Mapping[str, Any], host: float) -> int | None:
-        """Stamp [ms] of a message that arrived at `host` [s, any steady clock]; None: not believed, or not known yet.
+        """Stamp [ms] of a message that arrived at `host` [s, any steady clock]; None: refused, or not known yet.
 
-        A message without a stamp of its own gets the newest stamp of the others: it is at least as new.
+        A message without its own stamp gets the newest stamp of the others: it is at least as new.
 
-        Raises: RestartedError after many stamps in a row that are far from those before.
+        Raises: RestartedError after `_RESTART_REFUSALS` refused stamps in a row.
         """
         stamp = self._stamp_of(fields)
         if stamp is None:

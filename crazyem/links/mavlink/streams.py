@@ -1,7 +1,7 @@
-"""From MAVLink messages to log blocks: which messages are asked for, and what of each goes into packets.
+"""From MAVLink messages to log blocks: the requested messages, and the fields of each in packets.
 
-A block has the fields of its message as they were sent. Only outputs, rotor speeds, battery and state are put together
-here, because they need parameters or several messages: they have names of their own (`crazyem.signals.mavlink`).
+A block has the fields of its message as sent. Only outputs, rotor speeds, battery and state are computed here, because
+they need parameters or several messages. They have their own names (`crazyem.signals.mavlink`).
 """
 
 import math
@@ -12,14 +12,14 @@ from crazyem.links.mavlink.motors import Outputs
 from crazyem.signals.mavlink import BATTERY, INFO, MAPPINGS, OUTPUTS, ROTORS
 from crazyem.signals.sample import Block, Variable
 
-# Bits of the Crazyflie's supervisor, which everything above understands.
+# Bits of the Crazyflie's supervisor, as used in the rest of the program.
 CAN_ARM, ARMED, AUTO_ARM, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << i for i in range(8))
 _SAFETY_ARMED = 128  # bit of HEARTBEAT.base_mode
 _STANDBY, _ACTIVE, _CRITICAL, _EMERGENCY, _POWEROFF, _TERMINATION = range(3, 9)  # MAV_STATE
 _IN_AIR = {2, 3, 4}  # MAV_LANDED_STATE: in air, taking off, landing
 NO_CELL = 65535
 
-# Asked for at the rate of the log; the state of battery and drone comes slower.
+# Requested at the rate of the log; the states of battery and drone are slower.
 FAST_MESSAGES = ("LOCAL_POSITION_NED", "ATTITUDE_QUATERNION", "ATTITUDE", "HIGHRES_IMU", "ACTUATOR_OUTPUT_STATUS",
         "SERVO_OUTPUT_RAW", "ESC_STATUS", "ESC_TELEMETRY_1_TO_4", "POSITION_TARGET_LOCAL_NED")  # fmt: skip
 SLOW_MESSAGES = ("BATTERY_STATUS", "SYS_STATUS", "EXTENDED_SYS_STATE")
@@ -29,7 +29,7 @@ STREAM_GROUPS = ((1, True), (2, False), (3, True), (6, True), (10, True), (11, T
 
 _BLOCK_TYPES = {"outputs": "float", "rotors": "float", "battery": "uint32_t"}
 _INTEGER_TYPES = {"SCALED_IMU": "int16_t", "RAW_IMU": "int16_t"}
-# Of several messages with the same, only one is taken: the first of these that comes.
+# Of several messages with the same content, only one is used: the first in this order that arrives.
 ALTERNATIVE_MESSAGES: tuple[tuple[str, ...], ...] = (
     ("ATTITUDE_QUATERNION", "ATTITUDE"),
     ("HIGHRES_IMU", "SCALED_IMU", "RAW_IMU"),
@@ -41,7 +41,7 @@ _POSITION_BITS, _LOCAL_FRAME = 0x007, 1
 
 
 def block_names() -> tuple[str, ...]:
-    """Every block there can be, in the order of their numbers."""
+    """All possible blocks, in the order of their numbers."""
     return (*dict.fromkeys(m.message for m in MAPPINGS), INFO)
 
 
@@ -58,11 +58,11 @@ class Streams:
     """Turns messages into values of blocks.
 
     Args:
-        outputs: how to read motors.
+        outputs: mapping of the motor outputs.
 
     Attributes:
-        cells: of the battery, 0 while unknown.
-        info: what the autopilot says of itself, in the supervisor's bits; None before its first heartbeat.
+        cells: number of battery cells, 0 if unknown.
+        info: state of the autopilot in the supervisor's bits; None before its first heartbeat.
     """
 
     def __init__(self, outputs: Outputs | None = None) -> None:
@@ -87,15 +87,15 @@ class Streams:
 
     @property
     def messages(self) -> set[str]:
-        """Names of all messages that are of any use here."""
+        """Names of all messages that can be used."""
         return {*self._plain, *self._special}
 
     def choose(self, seen: set[str], *, raw_imu: bool) -> set[str]:
-        """Settle which messages are used, of those `seen`; returns the names of the blocks that follow."""
+        """Select the messages to use, from those `seen`; returns the names of their blocks."""
         dropped: set[str] = set() if raw_imu else {"RAW_IMU"}
         for group in ALTERNATIVE_MESSAGES:
             present = [m for m in group if m in seen and m not in dropped]
-            # what has not come yet may still come, as long as nothing else serves
+            # if no alternative has arrived, all remain possible
             dropped |= set(group) - set(present[:1]) if present else set()
         self._taken = self.messages - dropped
         blocks = {m for m in seen if m in self._plain} - dropped
@@ -104,11 +104,11 @@ class Streams:
         return blocks | {BATTERY, INFO, "POSITION_TARGET_LOCAL_NED"}
 
     def uses(self, name: str) -> bool:
-        """Whether this message is one of those settled on, or nothing is settled yet."""
+        """Whether this message is selected, or no selection was made yet."""
         return self._taken is None or name in self._taken
 
     def values(self, name: str, fields: Mapping[str, Any]) -> tuple[str, tuple[float, ...]] | None:
-        """Block and its values from a message; None: nothing for a block, or not a value (NaN, masked, no reading)."""
+        """Block and its values from a message; None: not for a block, or no valid value (NaN, masked, no reading)."""
         special = self._special.get(name)
         found = special(fields) if special is not None else self._fields(name, fields)
         if found is None or not all(math.isfinite(v) for v in found[1]):
@@ -156,7 +156,7 @@ class Streams:
         return BATTERY, (float(millivolts),)
 
     def _count_cells(self, told: int, millivolts: float) -> None:
-        """Some tell each cell, some only the sum: then the fewest cells that 4.3 V each allow."""
+        """Update the number of cells; if only the total voltage is known, the least number with at most 4.3 V each."""
         self.cells = max(self.cells, told if told > 1 else math.ceil(millivolts / 4300.0))
 
     def _heartbeat(self, fields: Mapping[str, Any]) -> tuple[str, tuple[float, ...]]:
@@ -180,7 +180,7 @@ class Streams:
 
 
 def blocks_of(names: set[str], rate_hz: float) -> dict[str, Block]:
-    """Blocks of these names, numbered by their place among all there can be."""
+    """Blocks of these names, numbered by their position among all possible blocks."""
     slow = {BATTERY, INFO}
     return {
         name: Block(number, variables_of(name), round(1000.0 / (min(SLOW_HZ, rate_hz) if name in slow else rate_hz)))

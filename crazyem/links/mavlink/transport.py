@@ -1,4 +1,4 @@
-"""URIs of MAVLink links and the bytes behind them: UDP that waits, UDP that calls, serial ports. No threads."""
+"""URIs of MAVLink links and their transports: UDP that listens, UDP that connects, serial ports. No threads."""
 
 import contextlib
 import re
@@ -16,7 +16,7 @@ _BAUD_RATES = range(300, 12_000_001)
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where a drone is: kind is udpin, udpout or serial. `system` is the one to talk to, None: the first heard."""
+    """Address of a drone: kind is udpin, udpout or serial; `system` is its number, None: the first one received."""
 
     kind: str
     host: str = ""
@@ -27,7 +27,7 @@ class Address:
 
 
 def parse(uri: str) -> Address:
-    """The address of a URI. Raises UsageError, naming the URI and what is wrong with it."""
+    """The address in a URI. Raises UsageError, which names the URI and its error."""
     if not uri.startswith(SCHEME) or not uri.isprintable() or len(uri) > 500:
         raise UsageError(f'"{uri[:100]!s}" is no MAVLink URI; it should look like {ADDRESS_EXAMPLES}.')
     place, _, query = uri[len(SCHEME) :].partition("?")
@@ -64,13 +64,13 @@ def _digits(text: str) -> bool:
 
 
 _SOCKET_BUFFER = 1 << 20  # bytes
-_LARGEST_READ = 65536  # bytes taken at once
+_LARGEST_READ = 65536  # bytes of one read
 
 Peer = tuple[str, int] | None
 
 
 class Transport(Protocol):
-    """`receive` gives what has come within a time, and from whom; `send` never blocks for long and never raises."""
+    """Interface of a transport: `receive` gives bytes and their sender; `send` blocks only briefly and never raises."""
 
     where: str
 
@@ -81,7 +81,7 @@ class Transport(Protocol):
 
 
 class UdpTransport:
-    """UDP. "in": bound, sends to whomever `answer` named. "out": sends to the address, hears nobody else."""
+    """UDP. "in": bound, sends to the peer set by `answer`. "out": sends to the address, receives only from it."""
 
     def __init__(self, address: Address) -> None:
         family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
@@ -111,7 +111,7 @@ class UdpTransport:
             return b"", None
         except ValueError:
             raise LinkError("the UDP socket was closed.") from None
-        except OSError:  # an ICMP error: nobody listens there yet
+        except OSError:  # an ICMP error: no program listens there yet
             return b"", None
         return data, (str(sender[0]), int(sender[1]))
 
@@ -123,7 +123,7 @@ class UdpTransport:
                 self._socket.sendto(data, self._peer)
             else:
                 return False
-        except OSError:  # not reachable, or no room: as good as lost in the air
+        except OSError:  # not reachable, or no buffer: like a packet lost in the air
             return False
         return True
 
@@ -166,7 +166,7 @@ class SerialTransport:
             return False
 
     def answer(self, sender: Peer) -> None:
-        """There is only one at the other end."""
+        """Does nothing: a serial port has only one peer."""
 
     def close(self) -> None:
         with contextlib.suppress(*self._errors):
@@ -174,5 +174,5 @@ class SerialTransport:
 
 
 def open_transport(address: Address) -> Transport:
-    """Raises LinkError if it cannot be opened."""
+    """Open the transport of an address. Raises LinkError if this fails."""
     return SerialTransport(address) if address.kind == "serial" else UdpTransport(address)
