@@ -1,11 +1,11 @@
-"""Units of firmware log variables that are in no vocabulary, by name: what viewers and exports write beside them.
+"""Units of firmware log variables by name, also of those outside the vocabulary, for viewers and exports.
 
-Sources: the log groups of crazyflie-firmware (HEAD of August 2026). A name that is not here has no unit: "".
+Sources: the log groups of crazyflie-firmware (HEAD of August 2026). Other names have no unit: "".
 """
 
 import re
 
-# first match wins; patterns are of whole names
+# the first match counts; patterns match whole names
 _UNIT_PATTERNS: tuple[tuple[str, str], ...] = (
     (r"stateEstimate\.(roll|pitch|yaw)", "deg"),
     (r"stateEstimate\.a[xyz]", "g"),
@@ -39,7 +39,7 @@ _UNIT_PATTERNS: tuple[tuple[str, str], ...] = (
     (r"ctrltargetZ\.v[xyz]", "mm/s"),
     (r"ctrltargetZ\.a[xyz]", "mm/s^2"),
     (r"stabilizer\.(roll|pitch|yaw)", "deg"),
-    # PWM counts, 65535 being full; stabilizer.thrust is one only under some controllers
+    # PWM counts, 65535 is full; stabilizer.thrust is a PWM count only with some controllers
     (r"motor\.m\d(req)?|pwm\.m\d_pwm", "count"),
     (r"(controller|ctrlMel|ctrlINDI)\.cmd_(thrust|roll|pitch|yaw)|controller\.(actuatorThrust|ctr_yaw)", "count"),
     (r"ctrl(Lee|Lqg)\.thrustSi", "N"),
@@ -57,5 +57,5 @@ _COMPILED_PATTERNS = tuple((re.compile(pattern), unit) for pattern, unit in _UNI
 
 
 def unit_of(name: str) -> str:
-    """Unit of a firmware log variable as logged, "" where not known."""
+    """Unit of a firmware log variable as logged, "" if unknown."""
     return next((unit for pattern, unit in _COMPILED_PATTERNS if pattern.fullmatch(name)), "")

@@ -1,6 +1,6 @@
-"""Which fields of which MAVLink messages are which signals: one table for live links and for the reader of tlogs.
+"""Table from fields of MAVLink messages to signals, for live links and for the reader of tlogs.
 
-PX4 and MAVLink speak FRD bodies and a north-east-down world; ours are FLU and north-west-up: half a turn about x.
+PX4 and MAVLink use FRD bodies and a north-east-down world; ours are FLU and north-west-up: half a turn about x.
 Sources: mavlink.io/en/messages/common.html; units of RAW_IMU: ArduPilot's GCS_MAVLINK.
 """
 
@@ -10,18 +10,18 @@ from dataclasses import dataclass
 MILLI_G = 9.80665e-3  # m/s^2, the standard gravity of autopilots
 RPM_IN_RAD_PER_S = 2.0 * math.pi / 60.0
 
-# What is put together of several messages and parameters has names of its own, in our units and our order of rotors.
+# Blocks that are computed from several messages or parameters have their own names, and our order of rotors.
 OUTPUTS, ROTORS, BATTERY, INFO = "outputs", "rotors", "battery", "supervisor"
 
 
 @dataclass(frozen=True, slots=True)
 class Mapping:
-    """Fields of one message that are a signal.
+    """Fields of one message that form a signal.
 
     Attributes:
         signal: key of `crazyem.signals.sample.SIGNALS`.
-        message, fields: names, as MAVLink has them; of what has none, see `OUTPUTS`.
-        kind: how frames turn: "vector", "quaternion" (w x y z), "angles" (roll, pitch, yaw), "plain" (not at all).
+        message, fields: names in MAVLink; for computed blocks, see `OUTPUTS`.
+        kind: change of frame: "vector", "quaternion" (w x y z), "angles" (roll, pitch, yaw), "plain" (none).
         factor: to SI units.
     """
 
@@ -46,7 +46,7 @@ _ANGLES, _SPEEDS = _named("*", "roll pitch yaw"), _named("*speed", "roll pitch y
 _ACC, _GYRO = _named("*acc", "x y z"), _named("*gyro", "x y z")
 _FOUR = _named("m*", "1 2 3 4")
 
-# Best first within a signal: body rates that come with their attitude beat those of another instant.
+# Best first within a signal: body rates from the message of the attitude are better than those of another instant.
 MAPPINGS: tuple[Mapping, ...] = (
     Mapping("position", "LOCAL_POSITION_NED", _XYZ),
     Mapping("velocity", "LOCAL_POSITION_NED", _V),
@@ -70,7 +70,7 @@ _ATTITUDES = frozenset(row.message for row in MAPPINGS if row.signal == "attitud
 
 
 def carries_attitude(variable: str) -> bool:
-    """Whether a variable of a log is of a message with an attitude; a sender before it ("158/") is passed over."""
+    """Whether a log variable belongs to a message with an attitude; a prefix with the sender ("158/") is ignored."""
     return variable.rsplit("/", 1)[-1].split(".", maxsplit=1)[0] in _ATTITUDES
 
 

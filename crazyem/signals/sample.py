@@ -1,4 +1,4 @@
-"""What sources hand on: log packets of raw values as a firmware sends them, and time-stamped samples in SI units."""
+"""Data from sources: log packets with raw values of the firmware, and time-stamped samples in SI units."""
 
 from dataclasses import dataclass
 
@@ -63,7 +63,7 @@ SIGNALS: dict[str, tuple[int, str, str]] = {
     "setpoint_position": (3, "m", "world"),
     "setpoint_velocity": (3, "m/s", "world"),
     "flying": (1, "1", "1 while the firmware says that rotors turn, else 0"),
-    # From here on what recordings carry besides: for diagnosis and viewers, not for the estimator.
+    # Additional signals of recordings, for diagnosis and viewers, not for the estimator.
     "acceleration": (3, "m/s^2", "world, gravity removed"),
     "euler": (3, "rad", "roll, pitch, yaw (ZYX, right-handed), body FLU to world"),
     "motor_request": (4, "1", "thrust asked of rotors 1..4 before battery compensation, 0..1"),
@@ -85,7 +85,7 @@ COMPONENTS: dict[str, tuple[str, ...]] = {
     "mixer_command": ("thrust", "roll", "pitch", "yaw"),
 }
 
-# What the estimator is fed; the rest of a recording never reaches it.
+# Inputs of the estimator; other signals of a recording are not used by it.
 ESTIMATOR_SIGNALS: tuple[str, ...] = (
     "position",
     "velocity",

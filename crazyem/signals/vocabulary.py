@@ -1,8 +1,8 @@
-"""From firmware log variables to signals: which variables make a signal, and the units and signs between them.
+"""From firmware log variables to signals: the variables of each signal, and conversions of units and signs.
 
-The wire speaks g, degrees, millimetres, PWM counts and an inverted pitch; everything above speaks SI, FLU bodies and
-scalar-last quaternions. This file is the only place that knows both. Sources: crazyflie-firmware log tables (HEAD of
-August 2026), src/utils/interface/quatcompress.h, src/modules/src/stabilizer.c.
+The firmware sends g, degrees, millimetres, PWM counts and an inverted pitch; the rest of the program uses SI, FLU
+bodies and scalar-last quaternions. Only this file knows both. Sources: crazyflie-firmware log tables (HEAD of August
+2026), src/utils/interface/quatcompress.h, src/modules/src/stabilizer.c.
 """
 
 import math
@@ -16,7 +16,7 @@ from crazyem.errors import UsageError
 from crazyem.signals.mavlink import MAPPINGS
 from crazyem.signals.sample import ESTIMATOR_SIGNALS, SIGNALS, Block, Packet, Sample
 
-STANDARD_GRAVITY = 9.81  # m/s^2, the constant the firmware multiplies and divides by
+STANDARD_GRAVITY = 9.81  # m/s^2, the constant in the firmware
 _RPM_IN_RAD_PER_S = 2.0 * math.pi / 60.0
 _RPM_MISSING = 65535.0
 _QUAT_MASK = (1 << 9) - 1
@@ -28,8 +28,8 @@ Values = tuple[float, ...]
 def decompress_quaternion(compressed: int) -> Values:
     """Unit quaternion (x, y, z, w) from the firmware's smallest-three 32-bit code (quatcompress.h).
 
-    Bits 30-31 hold the index of the largest component, which is taken as positive; then 10 bits (sign, 9-bit
-    magnitude in units of sqrt(1/2)/511) for each of the others in order x, y, z, w. One step is 0.00138.
+    Bits 30-31 hold the index of the largest component, which is positive; then 10 bits (sign, 9-bit magnitude in
+    units of sqrt(1/2)/511) for each of the others in order x, y, z, w. One step is 0.00138.
     """
     code = int(compressed)
     largest = (code >> 30) & 3
@@ -71,14 +71,14 @@ def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Values:
     )
 
 
-# Each conversion exists for one packet (tuples, on the live path) and for whole columns (arrays, for recordings); both
-# do the same arithmetic in the same order, so that a replay sees bit for bit what the live loop saw.
+# Each conversion has a version for one packet (tuples, live) and one for whole columns (arrays, recordings). Both do
+# the same arithmetic in the same order, so that live values and replayed values are equal bit for bit.
 Columns = Sequence[NDArray[np.float64]]
 
 
 @dataclass(frozen=True, slots=True)
 class Conversion:
-    """From firmware values to the components of a signal: `one` packet's, and `many` ((n,) columns to (n, c))."""
+    """Conversion of firmware values to the components of a signal: `one` packet, or `many` ((n,) columns to (n, c))."""
 
     one: Callable[[Values], Values]
     many: Callable[[Columns], NDArray[np.float64]]
@@ -99,7 +99,7 @@ def _divided(divisor: float) -> Conversion:
 
 
 def _cut_off(divisor: float) -> Conversion:
-    """Counts that the firmware cut off, not rounded: the middle of the count. Nothing measured is 0 and stays 0."""
+    """Conversion of truncated counts to the middle of the count; 0 means no measurement and stays 0."""
 
     def many(columns: Columns) -> NDArray[np.float64]:
         counts = _stacked(columns)
@@ -109,7 +109,7 @@ def _cut_off(divisor: float) -> Conversion:
 
 
 def _row_by_row(one: Callable[[Values], Values], width: int) -> Conversion:
-    """For the rare ones: the scalar arithmetic itself, since sin and cos of numpy may differ in the last bit."""
+    """A conversion of columns row by row with scalar arithmetic: numpy's sin and cos may differ in the last bit."""
 
     def many(columns: Columns) -> NDArray[np.float64]:
         rows = zip(*(np.asarray(c, float).tolist() for c in columns), strict=True)
@@ -240,7 +240,7 @@ MAVLINK_SOURCES: tuple[Source, ...] = tuple(
 )
 _MAVLINK_OUTPUTS = tuple(s for s in MAVLINK_SOURCES if s.signal == "motor_command")
 
-# Best first within a signal: a float log beats its quantised twin, a real duty beats nothing.
+# Best first within a signal: a float log before its quantised form.
 SOURCES: tuple[Source, ...] = (
     Source("position", _names("stateEstimate.*", "x y z"), _as_is),
     Source("position", _names("stateEstimateZ.*", "x y z"), _divided(1000.0)),
@@ -259,7 +259,7 @@ SOURCES: tuple[Source, ...] = (
     Source("rotor_speed", _names("motor.*_rpm", "m1 m2 m3 m4"), _rpm),
     Source("rotor_speed", _names("rpm.*", "m1 m2 m3 m4"), _rpm),
     Source("voltage", ("pm.vbat",), _as_is),
-    # whole mV of a cell, cut off (pmSetBatteryVoltage): read as rounded, thrust and mass are 0.025 % too small
+    # whole mV of a cell, truncated (pmSetBatteryVoltage): uncorrected, thrust and mass would be 0.025 % too small
     Source("voltage", ("pm.vbatMV",), _cut_off(1000.0)),
     Source("wrench_command", _names("ctrlLee.*", "thrustSi torquex torquey torquez"), _as_is),
     Source("wrench_command", _names("ctrlLqg.*", "thrustSi torquex torquey torquez"), _as_is),
@@ -275,7 +275,7 @@ SOURCES: tuple[Source, ...] = (
     Source("setpoint_acceleration", _names("ctrltarget.*", "ax ay az"), _as_is),
     *MAVLINK_SOURCES,
 )
-# Which of these motor.m1..4 is depends on the firmware (crazyem/recordings/motor_meaning.py); pwm.* is always real.
+# motor.m1..4 is a duty or a request, depending on the firmware (crazyem/recordings/motor_meaning.py); pwm.* is a duty.
 DUTY_SOURCES: tuple[Source, ...] = (
     Source("motor_command", _names("pwm.*_pwm", "m1 m2 m3 m4"), _divided(65535.0)),
     Source("motor_command", _names("motor.*", "m1 m2 m3 m4"), _divided(65535.0)),
@@ -287,28 +287,28 @@ REQUEST_SOURCES: tuple[Source, ...] = (
     *_MAVLINK_OUTPUTS,
 )
 
-# Blocks that each fit one packet of 26 bytes; what the estimator asks for when the user names nothing.
+# Default blocks of the estimator; each fits into one packet of 26 bytes.
 STATE_BLOCK = _names("stateEstimateZ.*", "x y z vx vy vz quat")
 IMU_BLOCK = (*_names("gyro.*", "x y z"), *_names("acc.*", "x y z"))
 MOTOR_BLOCK = (*_names("motor.*", "m1 m2 m3 m4"), "pm.vbatMV", "supervisor.info")
 ROTOR_SPEED_BLOCK = _names("motor.*_rpm", "m1 m2 m3 m4")
 STANDARD_BLOCKS: tuple[tuple[str, ...], ...] = (STATE_BLOCK, IMU_BLOCK, MOTOR_BLOCK)
-# And what a session logs.
+# Variables that a session logs.
 STATE_VARIABLES = STATE_BLOCK + tuple(f"stateEstimateZ.rate{a}" for a in ("Roll", "Pitch", "Yaw"))
 EXTRA_VARIABLES = tuple(f"acc.{a}" for a in "xyz") + tuple(f"ctrltargetZ.{a}" for a in "xyz")
 WRENCH_VARIABLES = ("thrustSi", "torquex", "torquey", "torquez")
 
 
 def block_plan(available: Sequence[str], *, wrench: str = "ctrlLee") -> list[tuple[str, ...]]:
-    """Blocks to log, of what the drone offers, each within 26 bytes; the estimator's needs first.
+    """Blocks to log from the drone's variables, each within 26 bytes; those for the estimator come first.
 
-    The whole rigid state of one instant (22 bytes), motors with voltage and flight state (12, or 20 with rotor
-    speeds), accelerometer and active setpoint (18), commanded wrench (16). Body rates come in the state block, in
-    steps of 1 mrad/s, rather than as gyro.* in a packet of another instant: blocks are not sampled together, and one
-    sample of everything is worth more to the estimator than two halves.
+    The rigid state of one instant (22 bytes), motors with voltage and flight state (12, or 20 with rotor speeds),
+    accelerometer and active setpoint (18), commanded wrench (16). Body rates are in the state block, in steps of
+    1 mrad/s, and not gyro.* of another block: blocks are not sampled at the same time, and one complete sample is worth
+    more to the estimator than two halves.
 
     Raises:
-        UsageError: naming a variable the estimator cannot do without.
+        UsageError: a variable that the estimator needs is missing.
     """
     names = set(available)
     for needed in (*STATE_VARIABLES, *MOTOR_BLOCK):
@@ -321,11 +321,11 @@ def block_plan(available: Sequence[str], *, wrench: str = "ctrlLee") -> list[tup
 
 
 def standard_variables(available: Mapping[str, str] | Iterable[str], *, rotor_speed: bool = True) -> tuple[str, ...]:
-    """Variables the estimator wants, out of those the drone offers.
+    """Variables of the drone that the estimator uses.
 
     Args:
         available: names of the drone's log variables.
-        rotor_speed: add measured rotor speeds where the drone has them.
+        rotor_speed: add measured rotor speeds if the drone has them.
 
     Returns: state, IMU, motor commands with voltage and flying flag, and rotor speeds if all four exist.
     """
@@ -337,7 +337,7 @@ def standard_variables(available: Mapping[str, str] | Iterable[str], *, rotor_sp
 
 
 def sampled_together(variables: Iterable[str]) -> tuple[tuple[str, ...], ...]:
-    """Groups of `variables` that must share a packet: the standard blocks first, then the parts of each signal."""
+    """Groups of `variables` that must share a packet: the standard blocks, then the components of each signal."""
     wanted = list(dict.fromkeys(variables))
     groups: list[tuple[str, ...]] = []
     taken: set[str] = set()
@@ -353,8 +353,8 @@ class BlockDecoder:
     """Turns the packets of one block into samples.
 
     Args:
-        block: the block as subscribed or as recorded.
-        signals: decode only these (to avoid counting a signal twice when two blocks carry it); None = all.
+        block: as subscribed or as recorded.
+        signals: decode only these, because two blocks may have the same signal; None = all.
     """
 
     def __init__(self, block: Block, signals: Iterable[str] | None = None) -> None:
@@ -381,7 +381,7 @@ class BlockDecoder:
 
 
 def decoders(blocks: Iterable[Block]) -> dict[int, BlockDecoder]:
-    """One decoder a block, each signal decoded from one block only: the one with the best source for it."""
+    """One decoder for each block; each signal is decoded only from the block with its best source."""
     blocks = tuple(blocks)
     names = {block.identifier: {v.name for v in block.variables} for block in blocks}
     assigned: dict[str, int] = {}
