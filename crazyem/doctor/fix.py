@@ -190,7 +190,7 @@ def _attitude_at(stamps: Array, attitude: Array, time: Array) -> Array:
 
 
 def _separate_streams(signals: Signals, before: Mapping[str, SignalArray], fix: Fix) -> Signals:
-    """Give signals whose stamps now differ from those of their stream a stream of their own."""
+    """Give signals with changed stamps a separate stream if the rest of their stream is unchanged."""
     changed = set(fix.signals)
     for stream in {before[name].stream for name in changed}:
         members = {name for name, array in before.items() if array.stream == stream}

@@ -253,9 +253,7 @@ SOURCES: tuple[Source, ...] = (
     Source("body_rate", _names("gyro.*", "x y z"), _scaled(math.pi / 180.0)),
     Source("body_rate", _names("stateEstimateZ.*", "rateRoll ratePitch rateYaw"), _legacy_rates),
     Source("specific_force", _names("acc.*", "x y z"), _scaled(STANDARD_GRAVITY)),
-    Source(
-        "motor_command", _names("motor.*", "m1 m2 m3 m4"), _divided(65535.0)
-    ),  # today's firmware: what a link speaks
+    Source("motor_command", _names("motor.*", "m1 m2 m3 m4"), _divided(65535.0)),  # present firmware, as over a link
     Source("rotor_speed", _names("motor.*_rpm", "m1 m2 m3 m4"), _rpm),
     Source("rotor_speed", _names("rpm.*", "m1 m2 m3 m4"), _rpm),
     Source("voltage", ("pm.vbat",), _as_is),
