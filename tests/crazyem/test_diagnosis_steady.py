@@ -249,7 +249,7 @@ def test_noise_under_which_a_variance_is_none_is_not_likely(monkeypatch) -> None
 
 
 def test_what_wanders_is_fitted_beside_the_flights(monkeypatch) -> None:
-    """Fits that went on from where it led did not come back."""
+    """The model with disturbances is fitted on a copy, so that the fit with the data as they are does not start there."""
     drag = Candidate("linear_drag", (), ("x", "y", "z"))
     data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.0)), seconds=8.0, seed=3), DRONE)])
     fitted = refine_base(data, nominal(data, Point(DRONE, {}, first_guess())).with_effects({"linear_drag": {}}), [drag])
@@ -262,6 +262,6 @@ def test_what_wanders_is_fitted_beside_the_flights(monkeypatch) -> None:
     monkeypatch.setattr(pruning, "refine_base", recorded)
     monkeypatch.setattr(pruning, "MEMORY_NATS", -np.inf)
     step: Any = SimpleNamespace(taken=SimpleNamespace(candidate=drag, dispersion=1.0))
-    pruning.survive(data, fitted, [drag], [step], None, lambda text: None)
+    pruning.without_noise_alike(data, fitted, [drag], [step], None, lambda text: None)
     assert seen
     assert seen[0] is not data
