@@ -249,7 +249,7 @@ def test_noise_under_which_a_variance_is_none_is_not_likely(monkeypatch) -> None
 
 
 def test_what_wanders_is_fitted_beside_the_flights(monkeypatch) -> None:
-    """The model with disturbances is fitted on a copy, so that the fit with the data as they are does not start there."""
+    """The model with disturbances is fitted on a copy: the next fit does not start from there."""
     drag = Candidate("linear_drag", (), ("x", "y", "z"))
     data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.0)), seconds=8.0, seed=3), DRONE)])
     fitted = refine_base(data, nominal(data, Point(DRONE, {}, first_guess())).with_effects({"linear_drag": {}}), [drag])
