@@ -1,4 +1,4 @@
-"""Flights on disk: one reader a file format, all giving the same `Recording`; and the MCAP writer of our own."""
+"""Recorded flights: one reader per file format, all of which return a `Recording`; and the writer of MCAP files."""
 
 from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.finding import Finding, Fix, Grade

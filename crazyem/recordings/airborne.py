@@ -1,6 +1,6 @@
-"""When a recorded drone is in the air, what says so, and why: the one function that every command asks.
+"""When a recorded drone is in the air, and by which signals; all commands use this module.
 
-Rotors that carry, the firmware's flying flag, the height and impacts are used as far as the recording has them. The
+Evidence is the thrust of the rotors, the flying flag of the firmware, the height and impacts, as far as recorded. The
 live gate of the estimator (`estimation/contact.py`) cannot look ahead, so it may differ by fractions of a second.
 """
 
@@ -14,27 +14,27 @@ from crazyem.recordings.finding import intervals_of
 from crazyem.recordings.ordering import Array, Flags, Intervals, common, inside, ordered, thinned
 from crazyem.recordings.recording import Recording
 
-SHORTEST_FLIGHT = 0.4  # s of lift; less is a hop or a test of the rotors
+SHORTEST_FLIGHT = 0.4  # s of lift; a shorter one is a hop or a test of the rotors
 LONGEST_FALL = 0.6  # s without lift that a manoeuvre may have
-LONGEST_SILENCE = 1.0  # s without a sample (or five periods) after which nobody knows whether the drone still flew
-LIFTED_HEIGHT, CLEAR_HEIGHT = 0.03, 0.1  # m above the ground: in the air; and surely so,
-BOUNCE_SHARE = 0.25  # or this share of the greatest height: a hard landing throws a drone up by 0.12 m, from 1 m
-# s at rest, just before and after a flight, that show the floor: the height of an onboard filter drifts
+LONGEST_SILENCE = 1.0  # s; a gap longer than this and than five periods ends an interval of flight
+LIFTED_HEIGHT, CLEAR_HEIGHT = 0.03, 0.1  # m above the ground: in the air; higher than a bounce
+BOUNCE_SHARE = 0.25  # of the greatest height; higher is no bounce. A hard landing from 1 m bounces 0.12 m.
+# s at rest before and after a flight that give the height of the floor: the height of an onboard filter drifts
 FLOOR_SECONDS = 1.0
-LEAST_CLIMB = 0.15  # m of height that a flight told by its height alone must show
+LEAST_CLIMB = 0.15  # m; least climb of a flight where the height is the only evidence
 # A drone rests where means of 0.25 s stay within 2 mm for 1 s. In 43 recorded flights they stay within 1 mm on the
 # ground (motion capture, Lighthouse, onboard filters) and move by 3 mm or more in hover. Three standard errors of a
-# mean are allowed where the position is noisy (flow deck: 14 mm), and its resolution where that is coarse.
+# mean are allowed where the position is noisy (flow deck: 14 mm), and one step where its resolution is coarse.
 MEAN_SECONDS, REST_SECONDS, STILL_HEIGHT, STILL_STANDARD_ERRORS = 0.25, 1.0, 0.002, 3.0  # s, s, m, standard errors
-IMPACT_FORCE = 40.0  # m/s^2 of specific force, twice what rotors can do: the drone hit something
-AFTER_IMPACT, AROUND_IMPACT = 1.5, 0.25  # s before the end from which an impact is the end; s that it lasts
-# No signal of a drone is larger (SI; the fastest rotors reach 6e3 rad/s): a sample beyond is an error of transmission.
+IMPACT_FORCE = 40.0  # m/s^2; specific force of an impact, twice the largest that rotors cause
+AFTER_IMPACT, AROUND_IMPACT = 1.5, 0.25  # s; an impact so near the end is the end; left out around it
+# Largest values (SI; the fastest rotors reach 6e3 rad/s); a larger sample is an error of transmission.
 LARGEST_COMMAND = {"rotor_speed": 8000.0, "motor_command": 1.5, "motor_request": 1.5}
-# Least of (about) thrust, in the square of the signal's unit for duty and speed, below which rotors are off.
+# Rotors are off below this thrust, approximated by the square of duty or speed, else by the signal itself.
 _OFF_COMMAND = {"motor_command": 0.03, "motor_request": 0.1, "rotor_speed": 200.0**2, "mixer_command": 3000.0}
 _ROTOR_SIGNALS = ("motor_command", "motor_request", "rotor_speed", "wrench_command", "mixer_command")
 _RAW_MOTORS = ("motor.m1", "motor.m2", "motor.m3", "motor.m4")
-_FEWEST_SAMPLES = 10  # samples of a signal that says something
+_FEWEST_SAMPLES = 10  # a signal with no more samples is not used
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,14 +42,14 @@ class Airtime:
     """When the drone flew.
 
     Attributes:
-        flown: intervals in the air [s]; all of the recording where nothing tells (`known` is False).
-        airborne: the same with bounces before the climb and after the descent: the floor may push in it.
-        lifting: intervals in which the rotors carried about the weight; as `airborne` where no rotors are known.
-        judged_by: names of the signals that were used; () if none could tell.
-        reason: why nothing was flown, one clause; "" if something was.
+        flown: intervals in the air [s]; the whole recording if no signal shows a flight (`known` is False).
+        airborne: as `flown`, with bounces before the climb and after the descent, in which the floor may push.
+        lifting: intervals in which the rotors carried about the weight; as `airborne` without a signal of the rotors.
+        judged_by: names of the signals that were used; () without any.
+        reason: why the drone never flew, one clause; "" if it flew.
         ground: height of the ground in the frame of the position [m]; NaN where unknown.
         climbed: m, range of height; NaN without a position.
-        begin, end: s, of what was judged by.
+        begin, end: s; first and last sample of the signal that was used first.
     """
 
     airborne: Intervals
@@ -64,12 +64,12 @@ class Airtime:
 
     @property
     def known(self) -> bool:
-        """Whether any signal tells."""
+        """Whether any signal shows when the drone flew."""
         return bool(self.judged_by)
 
     @property
     def by_height_alone(self) -> bool:
-        """Whether nothing says what the rotors did."""
+        """Whether no signal of the rotors was used."""
         return not set(self.judged_by) - {"flying", "position"}
 
     @property
@@ -83,7 +83,7 @@ class Airtime:
 
 
 def airtime(recording: Recording) -> Airtime:
-    """When a recording is in the air. Never raises: where no signal tells, all of the recording counts."""
+    """When a recording is in the air. Never raises; without a usable signal: the whole recording."""
     place = _position(recording)
     rotors = _rotors(recording, moved=place is not None)
     found = None
@@ -102,9 +102,9 @@ def airtime(recording: Recording) -> Airtime:
 
 
 def _rotors(recording: Recording, *, moved: bool) -> tuple[str, Array, Array] | None:
-    """(signal, times (n,), (n, c)) of the first signal that says how hard the rotors work.
+    """Name, times (n,) and values (n, c) of the first signal that shows the thrust of the rotors.
 
-    A speed sensor that reads 0 throughout may not be connected; it is not asked where a position (`moved`) tells.
+    A speed sensor that reads 0 throughout may be unconnected: it is not used if a position (`moved`) or a flag exists.
     """
     for name in _ROTOR_SIGNALS:
         if name in recording.signals:
@@ -114,7 +114,7 @@ def _rotors(recording: Recording, *, moved: bool) -> tuple[str, Array, Array] | 
                 return name, time, value
     raw = [recording.signals[name] for name in _RAW_MOTORS if name in recording.signals]
     if len(raw) == len(_RAW_MOTORS) and len({array.time.size for array in raw}) == 1:
-        # duty or request: nobody knows which, but both say when the rotors carried
+        # duty or request: either one shows when the rotors carried the weight
         value = np.column_stack([array.value[:, 0] for array in raw]) / 65535.0
         sound = np.isfinite(value).all(axis=1) & np.isfinite(raw[0].time)
         if sound.sum() > _FEWEST_SAMPLES and (np.diff(raw[0].time[sound]) >= 0).all():
@@ -124,24 +124,24 @@ def _rotors(recording: Recording, *, moved: bool) -> tuple[str, Array, Array] | 
 
 def _from_rotors(name: str, time: Array, value: Array) -> Airtime:
     possible = np.abs(value).max(axis=1) <= LARGEST_COMMAND.get(name, math.inf)
-    if possible.sum() > _FEWEST_SAMPLES:  # a wild sample is no flight
+    if possible.sum() > _FEWEST_SAMPLES:  # without errors of transmission
         time, value = time[possible], value[possible]
     thrust = value[:, 0] if name in ("wrench_command", "mixer_command") else value.mean(axis=1)
     thrust = np.maximum(thrust, 0.0)
     if name in ("motor_command", "rotor_speed"):
-        thrust = thrust * thrust  # about: thrust grows with the square of duty and of speed
+        thrust = thrust * thrust  # thrust is about proportional to the square of duty and of speed
     peak = float(np.percentile(thrust, 99))
     lifting: Intervals = ()
     if peak > _OFF_COMMAND.get(name, 1e-3):
         high = thrust[thrust > 0.4 * peak]
-        level = float(np.median(high)) if high.size else peak  # near hover: most of a flight is
+        level = float(np.median(high)) if high.size else peak  # near hover, as most of a flight is
         lifting = _closed(time, thrust > 0.3 * level)
     why = "" if lifting else "its rotors never carried it"
     return Airtime(lifting, lifting, lifting, (name,), why, begin=float(time[0]), end=float(time[-1]))
 
 
 def _above_ground(found: Airtime, when: Array, z: Array) -> Airtime:
-    """Less the time on the ground, where the rotors rest long enough for the height (n,) of the ground to show."""
+    """Without the time on the ground, by the heights (n,), if rests of the rotors show the height of the ground."""
     found = replace(found, climbed=float(np.ptp(z)))
     known = (when >= found.begin) & (when <= found.end + 0.5)
     resting = known & ~inside(when, tuple((a - 0.1, b + 0.5) for a, b in found.lifting))
@@ -156,7 +156,7 @@ def _above_ground(found: Airtime, when: Array, z: Array) -> Airtime:
             airborne.append((start, end))
             flown.append((start, end))
             continue
-        # each flight rises from the floor as it was just before, and comes down to that just after
+        # the floor has one height before the flight and another after it: the height may drift
         top = when[within[np.argmax(z[within])]]
         sides = [
             resting & (when >= start - FLOOR_SECONDS) & (when < start),
@@ -175,7 +175,7 @@ def _above_ground(found: Airtime, when: Array, z: Array) -> Airtime:
 
 
 def _beyond_rotors(found: Airtime, time: Array, position: Array) -> Airtime:
-    """With the flight before and after what is known of the rotors, by the height, where they were at work there."""
+    """With flight before the first and after the last sample of the rotors, by the height, if they carried there."""
     ahead = bool(found.flown) and found.flown[0][0] <= found.begin + SHORTEST_FLIGHT
     behind = bool(found.flown) and found.flown[-1][1] >= found.end - SHORTEST_FLIGHT
     alone = _from_height(time, position).flown
@@ -197,7 +197,7 @@ def _beyond_rotors(found: Airtime, time: Array, position: Array) -> Airtime:
 
 
 def _off_the_ground(height: Array) -> Flags:
-    """Rows (n,) in the air, of heights above the ground [m]: without bounces before the climb and after the descent."""
+    """Rows (n,) in the air, from heights above the ground [m]; bounces before climb and after descent are left out."""
     lifted = height > LIFTED_HEIGHT
     high = np.flatnonzero(height > max(CLEAR_HEIGHT, BOUNCE_SHARE * float(height.max(initial=0.0))))
     if high.size:
@@ -209,7 +209,7 @@ def _off_the_ground(height: Array) -> Flags:
 
 
 def _closed(time: Array, flags: Flags) -> Intervals:
-    """Runs of True with short breaks closed and short runs dropped; parted where nothing was recorded."""
+    """Runs of True; short breaks are closed, short runs dropped, and a long gap in the samples ends a run."""
     steps = np.diff(time)
     silent = np.flatnonzero(steps > max(LONGEST_SILENCE, 5.0 * float(np.median(steps)))) if steps.size else steps
     merged: list[tuple[float, float]] = []
@@ -226,7 +226,7 @@ def _closed(time: Array, flags: Flags) -> Intervals:
 
 
 def _position(recording: Recording) -> tuple[Array, Array] | None:
-    """Times (n,) and positions (n, 3) of the first signal that measures it."""
+    """Times (n,) and positions (n, 3) of the first signal that measures the position."""
     for name, array in recording.signals.items():
         if (array.quantity == "position" or name == "position") and array.value.shape[1] == 3:
             time, value = ordered(thinned(array))
@@ -238,12 +238,12 @@ def _position(recording: Recording) -> tuple[Array, Array] | None:
 def _from_height(time: Array, position: Array) -> Airtime:
     """By the position alone: a drone flies above the place on which it rested before it rose.
 
-    A rest above the place from which the drone rose is a hover, one below or beside it is a new support. So a drone
-    that is taken off its table and carried away without being lifted never flew on that way.
+    A rest higher than the last support is a hover; any other rest is a new support. So a drone that is carried from
+    its table to a lower place, without being lifted, did not fly.
     """
     z = position[:, 2]
     rests = _rests(time, position)
-    if not rests and float(np.ptp(z)) > LEAST_CLIMB:  # it may drift sideways on its floor, but no lower than that
+    if not rests and float(np.ptp(z)) > LEAST_CLIMB:  # it may drift sideways at rest: height alone, near its least
         rests = [(a, b) for a, b in _rests(time, position[:, 2:]) if float(np.median(z[a:b])) < z.min() + LIFTED_HEIGHT]
     bare = Airtime((), (), (), ("position",), "", math.nan, float(np.ptp(z)), float(time[0]), float(time[-1]))
     if not rests:
@@ -255,7 +255,7 @@ def _from_height(time: Array, position: Array) -> Airtime:
         level = float(np.median(z[first:last]))
         if level < (supports[-1][2] if supports else start) + LIFTED_HEIGHT:
             supports.append((first, last, level))
-    if not supports:  # it rises from where the recording begins, and rests no more
+    if not supports:  # no rest on a support: the drone rises from its first height
         supports = [(0, 1, start)]
     found: list[tuple[float, float]] = []
     edges = [(0, supports[0][0], supports[0][2], supports[0][2])]
@@ -294,7 +294,7 @@ def _rests(time: Array, position: Array) -> list[tuple[int, int]]:
 
 
 def _allowed(position: Array, count: float) -> Array:
-    """(c,) m: the range within which means of `count` samples are still, by noise and resolution of each component."""
+    """(c,) m: largest range of means of `count` samples at rest, from noise and resolution of each component."""
     noise = np.sqrt(np.median(np.diff(position, 2, axis=0) ** 2, axis=0) / (6.0 * 0.455))  # 0.455: median of chi-square
     steps = np.abs(np.diff(position, axis=0))
     step = np.array([float(s[s > 1e-9].min(initial=math.inf)) for s in steps.T])
@@ -308,9 +308,9 @@ def _allowed(position: Array, count: float) -> Array:
 
 
 def _flagged(found: Airtime | None, recording: Recording) -> Airtime | None:
-    """Only while the firmware's flag says so, where there is one: from its first to its last sample that does.
+    """Flight only while the flying flag of the firmware is set, if there is such a flag.
 
-    The first and the last value of the recording hold before and after it.
+    The first value of the flag holds from the start of the recording, the last value to its end.
     """
     array = recording.signals.get("flying")
     time, value = ordered(array) if array is not None else (np.zeros(0), np.zeros((0, 1)))
@@ -336,7 +336,7 @@ def _flagged(found: Airtime | None, recording: Recording) -> Airtime | None:
 
 
 def _without_impacts(found: Airtime, recording: Recording) -> Airtime:
-    """Less what is near an impact, where no height tells; one shortly before the end of a flight is its end."""
+    """Without the time around impacts, for recordings without a height; a late impact ends the flight."""
     array = recording.signals.get("specific_force")
     if array is None:
         return found

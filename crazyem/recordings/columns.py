@@ -1,4 +1,4 @@
-"""A recording as one table: which column holds which component of which signal, and which row which samples."""
+"""A recording as one table: components of signals as columns, samples as rows."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -62,7 +62,7 @@ def entry_of(name: str, array: SignalArray) -> SignalEntry:
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """What a recording holds besides samples; of a recording in parts, what they add up to.
+    """All that a recording holds besides samples; of a recording in parts: of all parts together.
 
     Attributes:
         source: as in `Recording`.
@@ -102,7 +102,7 @@ class Column:
         name: unique, printable, without unit: "position_x", "voltage", "position_marked".
         unit: of its numbers.
         entry: the signal.
-        component: which of its components; None for the flag that tells marked samples.
+        component: number of the component; None for the flag of marked samples.
     """
 
     name: str
@@ -126,7 +126,7 @@ def _unique(wanted: str, used: set[str]) -> str:
 
 
 def describe(parts: Iterable[Recording]) -> Description:
-    """What the parts of a recording (or the one recording) add up to; holds one part at a time."""
+    """The description of a recording from all its parts; one part is in memory at a time."""
     source, origin = "", 0.0
     entries: dict[str, SignalEntry] = {}
     metadata: dict[str, dict[str, str]] = {}
@@ -169,16 +169,15 @@ class Rows:
 
 
 def rows_of(recording: Recording, names: Iterable[str], *, samples: int = 1 << 16) -> Iterator[Rows]:
-    """The named signals as rows, some at a time: what is held besides the recording does not grow with it.
+    """The named signals as rows, in blocks, so that the extra memory does not grow with the recording.
 
-    Samples that follow one another in processing order share a row if their stamps and host times are the same, bit
-    for bit, and the columns of the later one are further right. So the order of the samples is the order of reading
-    the table row by row, from left to right.
+    Consecutive samples (in processing order) share a row if their stamps and host times are equal bit for bit and the
+    columns of the later sample are further right. So row by row, from left to right, is the processing order.
 
     Args:
         recording: any.
-        names: in the order of the columns; those that it does not have are left out.
-        samples: most that are taken of a signal at once.
+        names: in the order of the columns; names that the recording does not have are left out.
+        samples: largest number of samples of a signal in a block.
     """
     arrays = {name: recording.signals[name] for name in names if name in recording.signals}
     places = {name: _by_order(array.order) for name, array in arrays.items()}
@@ -189,17 +188,17 @@ def rows_of(recording: Recording, names: Iterable[str], *, samples: int = 1 << 1
         taken = {name: _slice(places[name], at[name], ends[name]) for name in arrays}
         rows = _rows(arrays, taken)
         if any(ends[name] < order.size for name, order in orders.items()):
-            if rows.time.size < 2:  # the first row may go on
+            if rows.time.size < 2:  # the first row may continue in the next block
                 most *= 2
                 continue
-            rows = _without_last(rows)  # as this one may
+            rows = _without_last(rows)  # the last row may continue too
             ends = {name: at[name] + rows.row[name].size for name in arrays}
         yield rows
         at, most = ends, samples
 
 
 def _by_order(order: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """(n,) numbers of samples in processing order, None if they are in it."""
+    """(n,) numbers of the samples in processing order; None if they are in this order already."""
     return None if (order[1:] >= order[:-1]).all() else np.argsort(order, kind="stable")
 
 
@@ -208,11 +207,11 @@ def _slice(place: NDArray[np.int64] | None, begin: int, end: int) -> NDArray[np.
 
 
 def _ends(orders: dict[str, NDArray[np.int64]], at: dict[str, int], most: int) -> dict[str, int]:
-    """Up to where to take the samples of each signal: `most` of one of them, fewer of the others; at least one."""
+    """End of the block for each signal: `most` samples of one signal, fewer of the others; at least one sample."""
     full = [order[at[name] + most] for name, order in orders.items() if at[name] + most < order.size]
     if not full:
         return {name: order.size for name, order in orders.items()}
-    # samples of one order stay together, however many there are
+    # samples with the same order stay together
     first = min(int(order[at[name]]) for name, order in orders.items() if at[name] < order.size)
     limit = max(int(min(full)), first + 1)
     return {name: int(np.searchsorted(order, limit)) for name, order in orders.items()}
@@ -257,11 +256,11 @@ def _without_last(rows: Rows) -> Rows:
 
 
 def _printable(name: str) -> str:
-    """A name that fits one line of text: what cannot be printed becomes a question mark."""
+    """A name on one line of text; characters that cannot be printed become question marks."""
     return "".join(c if c.isprintable() else "?" for c in name)
 
 
 def name_and_unit(title: str) -> tuple[str, str]:
-    """Name and unit in the header of a column; unit "" where there are no brackets."""
+    """Name and unit in the header of a column; unit "" without brackets."""
     found = re.fullmatch(r"(.*) \[([^\[\]]*)\]", title)
     return (found.group(1), found.group(2)) if found else (title, "")

@@ -1,4 +1,4 @@
-"""What every reader gets: what the user has to tell it, the bytes of a file, bounded, and arrays that rows fill."""
+"""Shared by all readers: options of the user, the bytes of a file with a bounded size, and arrays that grow."""
 
 import gzip
 import zlib
@@ -15,15 +15,15 @@ from crazyem.errors import FileFormatError, UsageError
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """What a user may have to tell a reader.
+    """Options of the user for a reader.
 
     Attributes:
         mapping: TOML file that says which columns of a CSV are which signals (`--map`); None: by the header.
-        motor: what motor.m1..4 of an old log is where the file holds no evidence (`--motor`): "duty" (PWM sent, after
-            battery compensation) or "request" (thrust asked for, before it); None: say that it is not known.
-        start, end: read only what was sampled between these times [s] of the recording's time axis (`--from`, `--to`);
+        motor: meaning of motor.m1..4 where the file holds no evidence (`--motor`): "duty" (PWM sent, after battery
+            compensation) or "request" (thrust asked for, before compensation); None: a finding says it is unknown.
+        start, end: read only samples between these times [s] on the time axis of the recording (`--from`, `--to`);
             None: no limit.
-        as_published: believe a preset's publisher instead of correcting what is known to be wrong (`--as-published`).
+        as_published: do not correct the known errors of published data sets (`--as-published`).
     """
 
     mapping: str | None = None
@@ -34,14 +34,14 @@ class ReadOptions:
 
 
 LARGEST_FILE = 4 << 30  # bytes of a plain file: hours of a uSD log at 1 kHz
-LARGEST_UNPACKED = 1 << 30  # bytes of a gzip file, unpacked: a bomb has no end
+LARGEST_UNPACKED = 1 << 30  # bytes of a gzip file, unpacked: guards against decompression bombs
 
 
 def pieces(path: Path, size: int) -> Iterator[bytes]:
-    """The bytes of a file, plain or gzip (told by content), unpacked, up to `size` of them at a time.
+    """The bytes of a plain or gzip file (recognised by its content), unpacked, in pieces of up to `size` bytes.
 
-    Raises: UsageError if it cannot be read, FileFormatError if it is a gzip file that cannot be unpacked, or that
-        unpacks to more than `LARGEST_UNPACKED`.
+    Raises: UsageError if the file cannot be read, FileFormatError if a gzip file cannot be unpacked or unpacks to more
+        than `LARGEST_UNPACKED`.
     """
     taken = 0
     try:
@@ -68,16 +68,16 @@ def contents(path: Path) -> bytes:
         raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
     if size > LARGEST_FILE:
         raise FileFormatError(f"{path} is larger than {LARGEST_FILE >> 20} MiB, more than can be read at once.")
-    return b"".join(pieces(path, max(size, 1)))  # a plain file in one piece, which is not copied
+    return b"".join(pieces(path, max(size, 1)))  # one piece: no copy
 
 
 class GrowingArray:
-    """(n,) or (n, width) values to which rows are appended; a flight is held once, not as a list of blocks.
+    """(n,) or (n, width) values to which rows are appended, so that a flight is in memory once.
 
     Args:
         kind: numpy type of the values.
         width: of a row; None for single values.
-        expected: rows, as far as known: saves moving the array while it grows.
+        expected: number of rows, if known; saves copies while the array grows.
     """
 
     def __init__(self, kind: Any, width: int | None = None, *, expected: int = 0) -> None:
@@ -88,7 +88,7 @@ class GrowingArray:
         """Room for `count` rows after the last, to be filled."""
         first, self.size = self.size, self.size + count
         if self.size > len(self._array):
-            # what is never filled takes up no memory
+            # pages of memory that are never filled are never allocated
             larger = np.empty((max(self.size, 2 * first), *self._array.shape[1:]), self._array.dtype)
             larger[:first] = self._array[:first]
             self._array = larger
@@ -100,7 +100,7 @@ class GrowingArray:
         return self._array[: self.size]
 
     def take(self) -> NDArray[Any]:
-        """The rows, handed over and not kept; a copy where much of the array was not filled."""
+        """The rows, which this object then drops; a copy if much of the array was not filled."""
         array, size = self._array, self.size
         self._array, self.size = np.empty((0, *array.shape[1:]), array.dtype), 0
         return array[:size] if len(array) - size < len(array) // 16 else array[:size].copy()

@@ -1,4 +1,4 @@
-"""A piece of a recording: what was sampled between two times, as if only that had been recorded."""
+"""A piece of a recording: the samples between two times, as if nothing else had been recorded."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -84,14 +84,14 @@ def _cut(recording: Recording, low: float, high: float) -> Recording:
 
 
 def _within(event: Event, low: float, high: float, span: tuple[float, float] | None) -> bool:
-    """Whether an event is of the piece; words of the log are kept, they say what the flight was."""
+    """Whether an event belongs to the piece; log messages always do, because they describe the flight."""
     if event.data.get("clock") == "firmware":
         return low <= event.time <= high
     return event.kind == "log" or span is None or span[0] <= event.time <= span[1]
 
 
 def _finding(finding: Finding, kept: Mapping[str, NDArray[np.int64]], sizes: Mapping[str, int]) -> Finding:
-    """The finding with the rows of its repair counted anew; without the repair where they differ by signal."""
+    """The finding with the rows of its repair renumbered; without the repair if the rows differ between signals."""
     fix = finding.fix
     if fix is None or not fix.signals:
         return finding
@@ -106,6 +106,6 @@ def _finding(finding: Finding, kept: Mapping[str, NDArray[np.int64]], sizes: Map
     rows = place[fix.rows[inside]]
     left = rows >= 0
     factor = fix.factor
-    if fix.kind == "unwrap" and len(factor) == fix.rows.size:  # one a row
+    if fix.kind == "unwrap" and len(factor) == fix.rows.size:  # one factor per row
         factor = tuple(np.array(factor)[inside][left].tolist())
     return replace(finding, fix=replace(fix, rows=rows[left], factor=factor) if left.any() else None)

@@ -1,4 +1,4 @@
-"""The description of a recording as JSON, and back: what an exported table needs beside its numbers to be one again."""
+"""The description of a recording as JSON, and back: all that a reader needs beside the numbers of an exported table."""
 
 import math
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ _LARGEST_ROW = 2**62
 
 
 class _Signal(msgspec.Struct, rename={"parts": "components"}):
-    """A `SignalEntry` as it stands in the file."""
+    """A `SignalEntry` in the file."""
 
     name: str
     parts: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
@@ -31,7 +31,7 @@ class _Signal(msgspec.Struct, rename={"parts": "components"}):
 
 
 class _Event(msgspec.Struct, rename={"time": "time_s"}):
-    """An `Event` as it stands in the file."""
+    """An `Event` in the file."""
 
     time: float
     kind: str
@@ -39,7 +39,7 @@ class _Event(msgspec.Struct, rename={"time": "time_s"}):
 
 
 class _File(msgspec.Struct):
-    """A `Description` as it stands in the file; with other keys or types it is none."""
+    """A `Description` in the file; missing keys and other types are refused."""
 
     version: Literal[1]
     source: str
@@ -64,7 +64,7 @@ def to_json(description: Description) -> dict[str, Any]:
 
 
 def from_json(table: Any) -> Description:
-    """Inverse of `to_json`. Raises ValueError saying what does not fit."""
+    """Inverse of `to_json`. Raises ValueError with the reason."""
     if not isinstance(table, dict):
         raise ValueError("it is no table")
     table = {key: value if key == "metadata" else _back(value) for key, value in table.items()}
@@ -80,7 +80,7 @@ def from_json(table: Any) -> Description:
 
 
 def _plain(value: Any) -> Any:
-    """Only what JSON knows; numbers that are none become {"number": "nan"}."""
+    """The value in types of JSON; NaN becomes {"number": "nan"}, infinities likewise."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -1,7 +1,7 @@
 """Recordings as tables for other programs: CSV with a CSVW description beside it, and Parquet; nothing is resampled.
 
-A row is an instant: samples with the same stamp that follow one another. A field is empty (null) where a signal has no
-sample in that row, and NaN where it has one that is not a number.
+A row holds consecutive samples with the same stamp. A field is empty (null) if the signal has no sample in the row, and
+NaN if the sample is not a number.
 """
 
 import csv
@@ -24,16 +24,16 @@ from crazyem.recordings.recording import Recording
 TIME, HOST_TIME = "time [s]", "host_time [s]"
 METADATA_SUFFIX = "-metadata.json"  # CSVW: where programs look for the description of a CSV
 EXPORT_SUFFIXES = (".csv", ".parquet")
-_BLOCK_ROWS = 65536  # rows of a block: bounds what is held besides the recording
+_BLOCK_ROWS = 65536  # rows of a block; bounds the memory used besides the recording
 _TIME_COLUMNS = {"time": "on the clock of the recording", "host_time": "since the epoch, clock of the host"}
 
 
 def export(recording: Recording, path: str | Path, *, force: bool = False) -> Description:
     """Write a recording to `path`: .csv (and its -metadata.json) or .parquet.
 
-    Written beside the target first and moved there when complete.
+    A temporary file beside the target replaces it when complete.
 
-    Raises: UsageError if the suffix is neither, the file exists (unless `force`), or it cannot be written.
+    Raises: UsageError if the suffix is another one, the file exists (unless `force`), or it cannot be written.
     """
     return export_parts(lambda: iter((recording,)), path, force=force)
 
@@ -42,7 +42,7 @@ def export_parts(parts: Any, path: str | Path, *, force: bool = False) -> Descri
     """As `export`, for a recording in parts: one part is in memory at a time.
 
     Args:
-        parts: function without arguments that starts reading; called twice, for the columns and for the samples.
+        parts: function without arguments that returns the parts; called twice, for the columns and the samples.
         path: as in `export`.
         force: replace an existing file.
     """
@@ -62,7 +62,7 @@ def export_parts(parts: Any, path: str | Path, *, force: bool = False) -> Descri
 
 
 def _blocks(description: Description, parts: Iterable[Recording], schema: Any) -> Iterator[Any]:
-    """The table, a RecordBatch at a time."""
+    """The table as consecutive RecordBatches."""
     import pyarrow as pa
 
     names = [entry.name for entry in description.entries]
@@ -78,7 +78,7 @@ def _blocks(description: Description, parts: Iterable[Recording], schema: Any) -
 
 
 def _filled(recording: Recording, rows: Rows, column: Column, first: int, last: int) -> Any:
-    """Rows `first` to `last` of a column; null where the signal has no sample."""
+    """Rows `first` to `last` - 1 of a column; null where the signal has no sample."""
     import pyarrow as pa
 
     array = recording.signals.get(column.entry.name)
@@ -141,7 +141,7 @@ def _field(name: str, kind: Any, about: dict[str, str]) -> Any:
 
 
 def _about(column: Column) -> dict[str, str]:
-    """What is known of a column, in words."""
+    """The known properties of a column, by name."""
     entry = column.entry
     about = {"signal": entry.name, "quantity": entry.quantity, "unit": column.unit, "frame": entry.frame}
     about |= {"clock": entry.clock, "stream": entry.stream, "source": _source(column)}

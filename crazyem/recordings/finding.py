@@ -1,4 +1,4 @@
-"""What is odd about a recording: named, located in time, graded, with its evidence and what to do about it."""
+"""Findings, the problems of a recording: each with a name, times, a grade, evidence and advice."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 class Grade(StrEnum):
     """How much a finding matters to an estimate or a diagnosis made from the recording."""
 
-    HARMLESS = "harmless"  # good to know; results stand
-    DEGRADES = "degrades"  # results are worse or partly wrong unless it is dealt with
-    UNUSABLE = "unusable"  # the signal, or the recording, must not be used as it is
+    HARMLESS = "harmless"  # for information; results are not affected
+    DEGRADES = "degrades"  # results are worse or partly wrong unless the problem is solved
+    UNUSABLE = "unusable"  # the signal or the recording must not be used as it is
 
     @property
     def rank(self) -> int:
@@ -24,17 +24,17 @@ class Grade(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fix:
-    """A repair that loses nothing: it can be undone, or removes only what was never measured.
+    """A repair without loss: it can be undone, or removes only values that were never measured.
 
     Attributes:
         kind: "scale" multiplies the components of the signals by `factor` (unit, sign or scale); "world_to_body"
             rotates a world vector into the body frame by the attitude of the recording; "shift" adds `factor[0]`
             seconds to the stamps; "unwrap" adds `factor[i]` seconds to the stamps from sample `rows[i]` on; "mark"
             makes the samples in `rows` missing (they were never measured); "sort" brings samples into the order of
-            their stamps; "stamps" changes nothing: the reader has dealt with what had stamps that cannot be.
-        signals: names of the signals it changes.
-        factor: numbers, meaning by kind; one a component for "scale".
-        rows: sample numbers it applies to, None for all.
+            their stamps; "stamps" changes nothing: the reader has already treated the impossible stamps.
+        signals: names of the signals that change.
+        factor: numbers; `kind` says what they mean; one per component for "scale".
+        rows: numbers of the samples that change, None for all.
     """
 
     kind: str
@@ -50,7 +50,7 @@ class Fix:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finding:
-    """One thing that is odd about a recording.
+    """One problem or remarkable property of a recording.
 
     Attributes:
         check: which check found it, e.g. "gaps"; readers use "integrity", "interpolated", "mapping", "motor_meaning",
@@ -58,8 +58,8 @@ class Finding:
         grade: how much it matters.
         text: one sentence for people.
         signal: name of the signal concerned; "" for the whole recording.
-        intervals: (start, end) in s on the recording's time axis, in order; () if it concerns all of it.
-        evidence: the numbers behind it, by a name that carries the unit ("longest_s", "slope", "share").
+        intervals: (start, end) in s on the recording's time axis, in order; () for the whole recording.
+        evidence: numbers that support the finding, by a name that has the unit ("longest_s", "slope", "share").
         advice: what to do, one sentence.
         fix: a lossless repair, None if there is none.
     """
@@ -88,7 +88,7 @@ class Finding:
 
 
 def percent(share: float) -> str:
-    """A share for people, to two digits and never as a power of ten: "0.43 %", "12 %", "100 %"."""
+    """A share as text, to two digits and without a power of ten: "0.43 %", "12 %", "100 %"."""
     size = abs(100.0 * share)
     if 0.0 < size < 0.01:
         return "under 0.01 %"

@@ -1,20 +1,20 @@
-"""What motor.m1..4 of a firmware log is, decided from evidence in the log: thrust asked for, or the PWM that was sent.
+"""The meaning of motor.m1..4 in a firmware log, decided from evidence: the requested thrust, or the PWM sent.
 
-Until 2022-11-09 (crazyflie-firmware #1147, commit 96a23724) the firmware logged in motor.m1..4 what its mixer asked
-for, before the battery compensation; since then it logs the PWM ratio it sends, after it. Nothing in a file says which.
-What does tell, strongest first:
+Until 2022-11-09 (crazyflie-firmware #1147, commit 96a23724) motor.m1..4 is the request of the mixer, before battery
+compensation. Since then motor.m1..4 is the PWM ratio that is sent, after compensation. A file does not say which.
+The evidence, strongest first:
 
 * pwm.m1..4_pwm, always the PWM sent (#83, 2015): equal to motor.m1..4 or not.
 * The age of the firmware, from a version in the metadata, from variables that old firmware did not have, and from the
   type of motor.m1: int32 until 2020-02-28 (#554), uint32 then, uint16 since 2024-05-29 (#1380, e5eafd5c).
-* The mixer's arithmetic. Without compensation m1..4 = T -+ r +- p +- y, where r, p and y are whole numbers and T loses
-  its fraction: m1+m3-m2-m4, m1+m2-m3-m4 and m1+m4-m2-m3 are then multiples of 4, in every row. The compensation is not
-  linear and leaves that to chance, one row in 16. On real logs: 99.9 to 100 % of rows of known requests, 5 to 7 % of
-  known PWM (docs/reference/formats/usd.md).
-* controller.cmd_*, from which the mixer's output can be computed and compared.
+* The arithmetic of the mixer. Without compensation m1..4 = T -+ r +- p +- y, with whole numbers r, p, y and truncated
+  T. So m1+m3-m2-m4, m1+m2-m3-m4 and m1+m4-m2-m3 are multiples of 4 in every row. After compensation, which is not
+  linear, they are so by chance only, in one row of 16. On real logs: 99.9 to 100 % of rows of known requests, 5 to 7 %
+  of known PWM (docs/reference/formats/usd.md).
+* controller.cmd_*, from which the output of the mixer can be computed and compared.
 
-How the commands follow the battery is not used: on real flights whose answer is known, the slope of log(request) over
-log(voltage) came out at -1.07 +- 0.42, and at 0 it would have meant a request. Air and propellers change as much.
+The relation of commands and battery voltage is no evidence: the slope of log(request) over log(voltage) should be 0,
+but is -1.07 +- 0.42 on real flights with known requests. Air and propellers change the slope as much.
 """
 
 import re
@@ -33,29 +33,29 @@ _PWM_VARIABLES = tuple(f"pwm.m{i}_pwm" for i in (1, 2, 3, 4))
 _MIXER_VARIABLES = tuple(f"controller.cmd_{name}" for name in ("thrust", "roll", "pitch", "yaw"))
 _FULL_PWM = 65535.0
 
-# Variables that crazyflie-firmware got after the change, with the pull request and its date.
+# Variables that crazyflie-firmware has since the change or later, with pull request and date.
 _NEWER_VARIABLES: tuple[tuple[str, str], ...] = (
-    (r"motor\.m[1-4]req", "#1147, 2022-11"),  # came with the change itself: "requested, including compensation"
+    (r"motor\.m[1-4]req", "#1147, 2022-11"),  # part of the change: "requested, including compensation"
     (r"supervisor\.(info|accNorm)", "#1272 and #1281, 2023-05"),
     (r"ctrlLee\.(thrustSi|torque[xyz]|error_\w+)", "#1343, 2024-01"),
     (r"motor\.m[1-4]_e?rpm", "#1556, 2025-11"),
 )
-_FIRST_NEW_RELEASE, _LAST_OLD_RELEASE = (2023, 2), (2022, 9)  # releases known to be on either side
+_FIRST_NEW_RELEASE, _LAST_OLD_RELEASE = (2023, 2), (2022, 9)  # year and month of the releases next to the change
 _RELEASE_PATTERN = re.compile(r"\b(20\d\d)\.(\d{1,2})\b")
-_FEWEST_ROWS = 30  # fewer prove nothing: 0.1**30 and 0.5**30 are what chance would do
+_FEWEST_ROWS = 30  # fewer rows are no evidence; 30 rows agree by chance with probability 0.1**30 or 0.5**30
 _MEANING_NAMES = {"duty": "the PWM sent, after battery compensation", "request": "the thrust asked for, before it"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Meaning:
-    """What motor.m1..4 is.
+    """The meaning of motor.m1..4.
 
     Attributes:
-        meaning: "duty" (PWM sent, after battery compensation), "request" (thrust asked for, before it), or None where
-            nothing tells, or where the recording has no motor.m1..4.
+        meaning: "duty" (PWM sent, after battery compensation), "request" (thrust asked for, before compensation), or
+            None without evidence or without motor.m1..4.
         reason: why, one sentence; "" without motor.m1..4.
-        evidence: the numbers behind it.
-        findings: for the recording's `findings`: what was decided, or what the user has to say, or contradicts.
+        evidence: the numbers that support it.
+        findings: for the `findings` of the recording: the decision, a question to the user, or a contradiction.
     """
 
     meaning: str | None
@@ -71,7 +71,7 @@ class Meaning:
 
 @dataclass(slots=True)
 class _Votes:
-    """What each kind of evidence says, with its words."""
+    """Votes by kind of evidence: ("duty" or "request", reason)."""
 
     numbers: list[tuple[str, str]] = field(default_factory=list)  # pwm.*: the PWM itself
     age: list[tuple[str, str]] = field(default_factory=list)
@@ -82,13 +82,13 @@ class _Votes:
 def decide(
     tables: Sequence[Table], *, given: str | None = None, metadata: Mapping[str, Mapping[str, str]] | None = None
 ) -> Meaning:
-    """What motor.m1..4 of a recording is.
+    """Decide the meaning of motor.m1..4 of a recording.
 
     Args:
-        tables: firmware variables as logged, not interpolated; `ctypes` only where they are the firmware's own (a host
-            may fetch a variable as another type).
-        given: what the user says it is ("duty" or "request"); holds where nothing tells, and wins over what does, with
-            a finding.
+        tables: firmware variables as logged, not interpolated; `ctypes` only if they are the types in the firmware (a
+            host may fetch a variable as another type).
+        given: the meaning by the user ("duty" or "request"); overrides the evidence, and a finding reports a
+            contradiction.
         metadata: of the recording: a firmware version, or names of the drone's log variables in ["drone"].
 
     Raises: UsageError if `given` is something else.
@@ -207,7 +207,7 @@ def _judge_age(tables: Sequence[Table], metadata: Mapping[str, Mapping[str, str]
 
 
 def _version(metadata: Mapping[str, Mapping[str, str]]) -> tuple[int, int] | None:
-    """Year and month of the firmware's release, where a key or section of the metadata speaks of firmware."""
+    """Year and month of the firmware release, from metadata whose section or key contains "firmware"."""
     for section, entries in metadata.items():
         for key, text in entries.items():
             found = _RELEASE_PATTERN.search(text[:200])
@@ -218,7 +218,7 @@ def _version(metadata: Mapping[str, Mapping[str, str]]) -> tuple[int, int] | Non
 
 def _judge_mixer(table: Table, votes: _Votes) -> None:
     motor = _matrix(table, MOTOR_VARIABLES)
-    # a clipped rotor, or four equal ones (idle on the ground), obey or break the rule for other reasons
+    # rows with a clipped rotor or four equal ones (idle on the ground) are no evidence about the mixer
     usable = ((motor > 0) & (motor < _FULL_PWM) & (motor == np.floor(motor))).all(axis=0) & (np.ptp(motor, axis=0) > 0)
     rows = int(usable.sum())
     if rows < _FEWEST_ROWS:
@@ -239,7 +239,7 @@ def _judge_mixer(table: Table, votes: _Votes) -> None:
 
 
 def _compare_with_mixer(table: Table, motor: NDArray[np.float64], usable: NDArray[np.bool_], votes: _Votes) -> None:
-    """Against m = T -+ r +- p +- y of controller.cmd_*, which are 0 under controllers other than the PID."""
+    """Compare with m = T -+ r +- p +- y from controller.cmd_*, which are 0 unless the controller is the PID."""
     if not set(_MIXER_VARIABLES) <= table.columns.keys():
         return
     thrust, roll, pitch, yaw = _matrix(table, _MIXER_VARIABLES)

@@ -1,4 +1,4 @@
-"""Samples of a signal in order of time, thinned, and in intervals: what every reader of a recording's arrays needs."""
+"""Samples of a signal sorted by time or thinned, and intervals of time: helpers for arrays of a recording."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Intervals = tuple[tuple[float, float], ...]
 
-FINEST_INTERVAL = 0.005  # s between samples that `thinned` leaves: enough to see take-off and landing
+FINEST_INTERVAL = 0.005  # s; period of thinned samples, short enough to show take-off and landing
 
 
 def sound_rows(value: Array) -> Flags:
@@ -21,7 +21,7 @@ def sound_rows(value: Array) -> Flags:
 
 
 def ordered(array: SignalArray) -> tuple[Array, Array]:
-    """(n,) times and (n, c) values with increasing times, rows with NaN dropped. No copy if avoidable."""
+    """(n,) times and (n, c) values, sorted by time, without rows with NaN; copies only if necessary."""
     time, value = array.time, array.value
     keep = np.isfinite(time) & sound_rows(value)
     if not keep.all():
@@ -33,7 +33,7 @@ def ordered(array: SignalArray) -> tuple[Array, Array]:
 
 
 def thinned(array: SignalArray) -> SignalArray:
-    """Every k-th sample, so that some 200 a second are left."""
+    """Every k-th sample, so that about 200 samples per second remain."""
     if array.time.size < 2:
         return array
     period = (float(array.time[-1]) - float(array.time[0])) / max(array.time.size - 1, 1)
@@ -56,7 +56,7 @@ def common(one: Intervals, other: Intervals) -> Intervals:
 
 
 def held(time: Array, value: Array, at: Array) -> Array:
-    """The newest value (n,) at or before each of the times `at`; the first one before that."""
+    """(n,) the latest value at or before each of the times `at`; before the first sample: the first value."""
     return value[np.maximum(np.searchsorted(time, at, side="right") - 1, 0)]
 
 

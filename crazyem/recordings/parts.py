@@ -1,4 +1,4 @@
-"""Recordings too large for memory, read a stretch at a time where their reader can."""
+"""Recordings too large for memory, read in parts if their reader can do so."""
 
 import os
 from collections.abc import Iterator
@@ -9,9 +9,9 @@ from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import reader_of
 
-PART_SECONDS = 60.0  # of flight a part
-_MEMORY_SHARE = 0.25  # of the free memory that a file may take up before it is read in parts
-_GZIP_RATIO = 8.0  # how much larger a gzip file is once unpacked, about
+PART_SECONDS = 60.0  # s of flight in a part
+_MEMORY_SHARE = 0.25  # share of the free memory; a larger file is read in parts
+_GZIP_RATIO = 8.0  # size of an unpacked gzip file over its packed size, about
 
 
 def can_be_parted(path: Path) -> bool:
@@ -20,7 +20,7 @@ def can_be_parted(path: Path) -> bool:
 
 
 def to_be_parted(path: str | Path, *, asked: bool, jobs: int) -> bool:
-    """Whether to read a file in parts: where that was asked for or it is large, and its reader can."""
+    """Whether to read a file in parts: if the user asks or the file is large, and its reader can do so."""
     path = Path(path)
     return (asked or is_large(path, jobs=jobs)) and can_be_parted(path)
 
@@ -34,7 +34,7 @@ def is_large(path: Path, *, jobs: int = 1) -> bool:
 
 
 def free_memory() -> float:
-    """Bytes of memory that programs can have now."""
+    """Free memory now [bytes]."""
     try:
         with open("/proc/meminfo", encoding="ascii") as lines:
             for line in lines:
@@ -51,7 +51,7 @@ def free_memory() -> float:
 def open_parts(
     path: str | Path, options: ReadOptions | None = None, *, seconds: float = PART_SECONDS
 ) -> Iterator[Recording]:
-    """Consecutive stretches of a recording; memory is bounded by the length of one.
+    """Consecutive parts of a recording; the length of a part bounds the memory.
 
     Args:
         path: a file whose reader can read in parts.

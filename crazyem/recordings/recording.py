@@ -1,4 +1,4 @@
-"""A flight read from a file: arrays of signals in the order in which the estimator must see them, and what was odd."""
+"""A flight from a file: arrays of signals, the order in which the estimator processes the samples, and findings."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -21,20 +21,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SignalArray:
-    """All samples of one signal, as measured: at its own rate, nothing resampled, nothing filled in.
+    """All samples of one signal, as measured: at its own rate, neither resampled nor filled in.
 
     Attributes:
         time: (n,) s on the clock of the source, minus the recording's `origin`.
         value: (n, c) NaN where missing; SI for signals of the vocabulary, else in `unit`.
         order: (n,) position of each sample in the processing order of the whole recording.
         host_time: (n,) s since the epoch, NaN where unknown.
-        marked: (n,) True where a NaN is ours (interpolated stretch, sensor says "missing"), not the file's.
-        quantity: key of `crazyem.signals.sample.SIGNALS`, "" for a column nobody mapped.
+        marked: (n,) True where the reader set NaN (interpolated interval, sensor says "missing"), not the file.
+        quantity: key of `crazyem.signals.sample.SIGNALS`, "" for a column without a mapping.
         unit: of `value`; "" where the source does not say.
-        frame: as in `SIGNALS`, or what is known of it.
-        clock: "firmware", "host", or the name the source has for it; signals of one clock can be compared in time.
-        stream: signals with one stream were sampled together (a log block, a table, a topic) and share `time`.
-        source: the names in the file, one a component where there are several.
+        frame: as in `SIGNALS`, or as far as known.
+        clock: "firmware", "host", or the name in the source; times of signals with the same clock are comparable.
+        stream: signals with the same stream were sampled together (a log block, a table, a topic) and share `time`.
+        source: the names in the file, one per component if there are several.
     """
 
     time: NDArray[np.float64]
@@ -63,7 +63,7 @@ class SignalArray:
         return tuple(str(i) for i in range(count)) if count > 1 else ()
 
     def rows(self, chosen: slice | NDArray[np.int64]) -> "SignalArray":
-        """These samples alone, in this order."""
+        """The signal with only the chosen samples, in the chosen order."""
         return replace(
             self,
             time=self.time[chosen],
@@ -76,7 +76,7 @@ class SignalArray:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened in the flight: a push, a setpoint, a remark.
+    """An event in the flight: a setpoint, a write of a parameter, an estimate or a log message.
 
     Attributes:
         time: s since the epoch (host clock).
@@ -96,12 +96,12 @@ class Recording:
     Attributes:
         path: the file, as given.
         source: which reader and mapping produced it, e.g. "mcap" or "csv:nanobench".
-        signals: arrays by name: a key of `SIGNALS` for what the estimator should use, "<quantity>@<origin>" for
-            further measurements of the same quantity ("position@mocap"), and the source's own name for anything else.
-        metadata: run configuration and the like: section -> key -> text.
-        findings: what the reader noticed; the doctor looks for more.
-        events: what else happened, by time.
-        origin: s on the clock of the source at which `time` is 0; `origin + time` are the stamps of the file, exactly.
+        signals: arrays by name: a key of `SIGNALS` for inputs of the estimator, "<quantity>@<origin>" for further
+            measurements of the same quantity ("position@mocap"), and the name in the source for all others.
+        metadata: configuration of the run and similar texts: section -> key -> text.
+        findings: problems that the reader found; the doctor searches for more.
+        events: events in the flight, by time.
+        origin: s on the clock of the source at which `time` is 0; `origin + time` are exactly the stamps of the file.
     """
 
     path: str
@@ -114,7 +114,7 @@ class Recording:
 
     @property
     def notices(self) -> tuple[str, ...]:
-        """One sentence for each thing the reader noticed."""
+        """The sentence of each finding of the reader."""
         return tuple(finding.text for finding in self.findings)
 
     @property
@@ -124,7 +124,7 @@ class Recording:
         return float(max(t.max() for t in times) - min(t.min() for t in times)) if times else 0.0
 
     def to_dict(self) -> dict[str, Any]:
-        """What is in it, ready for JSON; without the samples."""
+        """A summary without the samples, ready for JSON."""
         signals = {
             name: {
                 "samples": int(a.time.size), "period_s": a.period, "unit": a.unit, "frame": a.frame, "clock": a.clock,
@@ -149,7 +149,7 @@ class Recording:
         return html_table(str(self), ("signal", "samples", "Hz", "unit", "frame"), rows, self.notices)
 
     def plot(self, path: str | Path | None = None) -> "Figure":
-        """The signals that an estimator uses, over time; saved where `path` says.
+        """Plot the signals that an estimator uses over time; saved to `path` if given.
 
         Raises:
             UsageError: the file cannot be written. MissingExtraError: no matplotlib.
@@ -168,7 +168,7 @@ class Recording:
         return sum(array.time.size for array in self.signals.values())
 
     def samples(self) -> Iterator[Sample]:
-        """Every sample the estimator is fed, in the order in which it was (or would have been) processed live."""
+        """Every sample for the estimator, in the order in which a live estimator processes them."""
         names = [name for name in self.signals if name in ESTIMATOR_SIGNALS and self.signals[name].time.size]
         if not names:
             return
@@ -184,7 +184,7 @@ class Recording:
             yield Sample(names[i], times[i][k], values[i][k], hosts[i][k])
 
     def check(self, required: Iterable[str]) -> None:
-        """Raise DataError if a required signal is absent or holds NaN that was in the file itself."""
+        """Raise DataError if a required signal is absent, has no times or contains NaN from the file itself."""
         for name in required:
             array = self.signals.get(name)
             if array is None or array.time.size == 0:
@@ -200,14 +200,14 @@ class Recording:
                 raise DataError(f"{self.path}: {name} has samples without a time.")
 
 
-# What names of attitudes that a filter on board made begin with, beside those of MAVLink: the Crazyflie's, ULog's.
+# Prefixes of names of attitudes from a filter on board, besides MAVLink: Crazyflie, ULog.
 CRAZYFLIE_PREFIXES = ("stateEstimate", "kalman.")
 ONBOARD_PREFIXES = (*CRAZYFLIE_PREFIXES, "vehicle_attitude.")
 
 
 def onboard_attitude(recording: Recording) -> bool:
-    """Whether the attitude is that of a filter on board, and not of motion capture: by its name, or by a CSV mapping
-    that claims it (`attitude = "onboard"`)."""
+    """Whether the attitude is from a filter on board, not from motion capture: by its name, or by the claim of a CSV
+    mapping (`attitude = "onboard"`)."""
     attitude = recording.signals.get("attitude")
     if attitude is None:
         return False
@@ -216,7 +216,7 @@ def onboard_attitude(recording: Recording) -> bool:
 
 
 def onboard_estimate(recording: Recording) -> bool:
-    """Whether a filter on board made the attitude, or the velocity of a recording that has no attitude."""
+    """Whether the attitude is from a filter on board; without an attitude: whether the velocity is."""
     velocity = recording.signals.get("velocity")
     if "attitude" in recording.signals or velocity is None:
         return onboard_attitude(recording)
@@ -224,7 +224,7 @@ def onboard_estimate(recording: Recording) -> bool:
 
 
 def crazyflie_attitude(recording: Recording) -> bool:
-    """Whether the attitude is that of a Crazyflie's own filter: by its name, whatever the rate."""
+    """Whether the attitude is from the filter of a Crazyflie, by its name, at any rate."""
     return "attitude" in recording.signals and _named(recording.signals["attitude"], CRAZYFLIE_PREFIXES)
 
 

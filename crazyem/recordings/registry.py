@@ -1,6 +1,6 @@
-"""Which reader opens which file: told by the file's first bytes, never by its name alone.
+"""The reader for each file, chosen by the first bytes of the file, never by its name alone.
 
-A reader for a new format is one file with `recognises` and `read`, and one line in `READERS`.
+A reader for a new format needs a file with `recognises` and `read`, and a line in `READERS`.
 """
 
 import importlib
@@ -24,7 +24,7 @@ class Reader:
 
     Its module has `recognises(head: bytes) -> bool`, given the (decompressed) first bytes of a file, and
     `read(path: Path, options: ReadOptions) -> Recording`, which raises FileFormatError. A reader of folders has
-    `recognises_folder(path: Path) -> bool` instead of, or besides, `recognises`. Imported on first use only.
+    `recognises_folder(path: Path) -> bool` instead of `recognises`, or both. The module is imported on first use.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Reader:
         return cut(screened(recording), options.start, options.end)
 
     def read_parts(self, path: Path, options: ReadOptions, seconds: float) -> Iterator[Recording]:
-        """As `read`, in parts; only of a reader that has the function."""
+        """As `read`, in parts; only for a reader whose module has `read_parts`."""
         parts = screened_parts(self._module().read_parts(path, options, seconds=seconds))
         return cut_parts(parts, options.start, options.end)
 
@@ -66,7 +66,7 @@ READERS: tuple[Reader, ...] = (
 )
 
 
-# What a file is by its first bytes that no reader reads, and what to do.
+# First bytes of known formats without a reader, and the message to the user.
 _REFUSALS: tuple[tuple[bytes, str], ...] = (
     (
         b"version https://git-lfs.github.com/spec/",
@@ -82,9 +82,9 @@ _REFUSALS: tuple[tuple[bytes, str], ...] = (
 
 
 def open_recording(path: str | Path, options: ReadOptions | None = None) -> Recording:
-    """Read a flight from any format we know.
+    """Read a flight from a file of any known format.
 
-    Raises: UsageError if there is no such file, FileFormatError if it is not a recording.
+    Raises: UsageError if there is no such file, FileFormatError if the file is not a recording.
     """
     path = Path(path)
     return reader_of(path).read(path, options or ReadOptions())

@@ -1,14 +1,14 @@
-"""Stamps that cannot be: of messages never published, of other clocks, of erased or damaged bytes.
+"""Impossible stamps: of messages never published, of other clocks, of erased or damaged bytes.
 
-One rule for all readers. A stamp cannot be if
+All readers use the same rule. A stamp is impossible if
 
-- the format writes it for "no stamp" (0 of a latched message; the reader says which value that is), or
-- it is farther from the others than any recording is long, or
-- it leaves the order of the records around it, which are in order without it. A clock that runs forward is its own
-  running median, so this is the filter of Hampel (1974) with a fixed limit.
+- the format uses its value for "no stamp" (0 of a latched message; the reader passes the value), or
+- its distance from the other stamps is longer than any recording, or
+- it breaks the order of its neighbours, which are in order without it. The running median of a clock that runs forward
+  is the clock itself, so this rule is the filter of Hampel (1974) with a fixed limit.
 
-A stream all of whose stamps are far from the others, and run beside them, is of another clock: it is shifted by one
-constant. What is left of a disorder (records that changed places, a clock that was set) is for the doctor.
+If all stamps of a stream are far from the others but run at the same speed, the stream has another clock: a constant
+shift corrects it. Other disorder (swapped records, a clock that was set) is left to the doctor.
 """
 
 import bisect
@@ -25,21 +25,21 @@ Column = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 LONGEST_RECORDING = 86_400.0  # s; no recording of a flight is longer than a day
-RESTART_SECONDS = 1.0  # s back from which a clock was set or started again; less is a record out of order
-_NEIGHBOURS = 3  # records before and after one that tell where its stamp should be
+RESTART_SECONDS = 1.0  # s; a larger step back is a clock that was set or restarted, a smaller one a late record
+_NEIGHBOURS = 3  # records before and after a record that show where its stamp should be
 STAMP_CHECK = "stamps"
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Stamps of one stream that cannot be.
+    """Impossible stamps of one stream.
 
     Attributes:
         stream: its name.
-        count: records concerned.
-        total: records of the stream.
-        what: was done with them: "left out", "placed by arrival" or "shifted".
-        example: one of the stamps [s], as in the file; the shift [s] of what was shifted.
+        count: number of records with such stamps.
+        total: number of records of the stream.
+        what: treatment of these records: "left out", "placed by arrival" or "shifted".
+        example: one of the stamps [s], as in the file; for "shifted": the shift [s].
     """
 
     stream: str
@@ -50,12 +50,12 @@ class Fault:
 
 
 def impossible(time: Column, *, centre: float | None = None, absent: float | None = None) -> Flags:
-    """(n,) True for stamps that cannot be.
+    """(n,) True for impossible stamps.
 
     Args:
         time: (n,) s, of one clock, in the order of the file.
-        centre: s, what other streams of the clock lie around; None: the median of these stamps.
-        absent: the stamp that says that there is none; None if there is no such.
+        centre: s, middle of the stamps of all streams on the clock; None: the median of these stamps.
+        absent: the value for "no stamp"; None if the format has none.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         bad = ~np.isfinite(time)
@@ -72,7 +72,7 @@ def impossible(time: Column, *, centre: float | None = None, absent: float | Non
 
 
 def _sound(time: Column) -> bool:
-    """Whether there is nothing to look for: finite, in order, no longer than a recording can be."""
+    """Whether all stamps are possible: in order, and no longer than a recording can be."""
     return time.size < 2 or bool((np.diff(time) >= 0).all() and time[-1] - time[0] <= LONGEST_RECORDING)
 
 
@@ -80,7 +80,7 @@ def out_of_order(time: Column) -> Flags:
     """(n,) True where a stamp breaks the order of those around it and is far from their median."""
     if time.size < 3 or bool((np.diff(time) >= 0).all()):
         return np.zeros(time.size, bool)
-    # where a clock starts again, the median may be of the other side, as many steps away as it reaches
+    # near a restart of the clock the median may come from the other side of the restart: the limit covers its window
     limit = max(RESTART_SECONDS, 2 * _NEIGHBOURS * float(np.median(np.abs(np.diff(time)))))
     away = np.abs(time - _running_median(time))
     far = ~(away <= limit)
@@ -93,7 +93,7 @@ def out_of_order(time: Column) -> Flags:
 
 
 def _without_those_in_order(time: Column, odd: Flags, away: Column) -> Flags:
-    """Flags without the stamps that are in order once the others are gone, those nearest to the median first."""
+    """Clear the flags of stamps that fit between the unflagged ones, in the order of their distance to the median."""
     kept = np.flatnonzero(~odd).tolist()
     for row in sorted(np.flatnonzero(odd).tolist(), key=lambda row: away[row]):
         place = bisect.bisect(kept, row)
@@ -107,33 +107,33 @@ def _without_those_in_order(time: Column, odd: Flags, away: Column) -> Flags:
 
 
 def _running_median(time: Column) -> Column:
-    from scipy.ndimage import median_filter  # takes long to import, and nearly no recording needs it
+    from scipy.ndimage import median_filter  # slow to import and rarely needed
 
     return np.asarray(median_filter(time, 2 * _NEIGHBOURS + 1, mode="mirror"), float)
 
 
 def restarts(time: Column) -> NDArray[np.int64]:
-    """Rows (k,) from which on a clock runs anew, from (n,) stamps [s] in order of arrival, of several streams or one.
+    """Rows (k,) at which a clock restarts, from (n,) stamps [s] of one or more streams in order of arrival.
 
-    A few stamps that are late or cannot be are no restart: the running median goes back where the clock does.
+    The running median shows a restart; a few late or impossible stamps do not change the median.
     """
     if time.size < 2 * _NEIGHBOURS + 1:
         return np.flatnonzero(np.diff(time) < -RESTART_SECONDS) + 1
     middle = _running_median(time)
     rows = []
     for row in np.flatnonzero(np.diff(middle) < -RESTART_SECONDS).tolist():
-        # the median crosses over where most of its window has; the stamps themselves do so nearby
+        # the median steps back when most of its window is past the restart; the step of the stamps is nearby
         window = np.arange(max(0, row - _NEIGHBOURS), min(time.size - 1, row + _NEIGHBOURS + 1))
         rows.append(int(window[np.argmin(np.diff(time)[window])]) + 1)
     return np.unique(np.array(rows, np.int64))
 
 
 def clock_offset(time: Column, place: Column, others: Column, places: Column) -> float | None:
-    """Seconds to add to the stamps of another clock; None if they do not run beside the others.
+    """Seconds to add to the stamps of another clock; None if this clock does not run like that of the others.
 
     Args:
-        time: (n,) s, stamps of one stream, place: (n,) where its records stand in the file, ascending.
-        others, places: (m,) the same of the streams on the recording's clock.
+        time, place: (n,) stamps of one stream [s], and places of its records in the file, ascending.
+        others, places: (m,) the same for the streams on the clock of the recording.
     """
     if time.size < _NEIGHBOURS or others.size < 2:
         return None
@@ -145,15 +145,15 @@ def clock_offset(time: Column, place: Column, others: Column, places: Column) ->
 def believed(
     names: Sequence[str], times: Sequence[Column], places: Sequence[Column], *, absent: float | None = None
 ) -> tuple[list[Flags], list[float], list[Fault]]:
-    """Streams on one clock: that of most records, which others are shifted to.
+    """Bring all streams to one clock, that of most records.
 
     Args:
         names: of the streams.
         times: (n,) s of each, in the order of the file.
-        places: (n,) where the records stand among those of all streams (or when they arrived); NaN where not known.
+        places: (n,) places (or times of arrival) of the records among those of all streams; NaN if unknown.
         absent: as in `impossible`.
 
-    Returns: the records of each stream to keep, the seconds to add to their stamps, and what was wrong.
+    Returns: the records of each stream to keep, the seconds to add to their stamps, and the faults.
     """
     pooled = np.concatenate(times) if times else np.empty(0)
     pooled = pooled[np.isfinite(pooled) & (pooled != absent)]
@@ -182,7 +182,7 @@ def finding(faults: Sequence[Fault], signals: Iterable[str] = ()) -> list[Findin
     """One finding for all faults of a recording; none without faults.
 
     Args:
-        signals: names of those concerned that the recording still has.
+        signals: names of the affected signals that the recording still has.
     """
     if not faults:
         return []
@@ -206,7 +206,7 @@ def finding(faults: Sequence[Fault], signals: Iterable[str] = ()) -> list[Findin
 
 
 def finding_in(faults: Sequence[Fault], signals: Mapping[str, SignalArray]) -> list[Finding]:
-    """As `finding`, of those of the signals whose stream is concerned."""
+    """As `finding`, with the names of the signals whose streams have faults."""
     streams = {fault.stream for fault in faults}
     return finding(faults, [name for name, array in signals.items() if array.stream in streams])
 
@@ -225,14 +225,14 @@ def _words(fault: Fault) -> str:
 
 
 def screened(recording: Recording) -> Recording:
-    """A recording without the samples whose stamps cannot be, and with a finding that says so; else the same."""
+    """The recording without samples that have impossible stamps, with a finding about them."""
     return next(screened_parts(iter([recording])))
 
 
 def screened_parts(parts: Iterator[Recording]) -> Iterator[Recording]:
-    """As `screened`, of a recording in parts; the finding, which counts all of them, comes with the last.
+    """As `screened`, of a recording in parts; the last part has the finding, which counts the stamps of all parts.
 
-    A stamp is judged beside its neighbours in the parts before and after.
+    The neighbours of a stamp include those in the parts before and after.
     """
     before: dict[str, Column] = {}
     faults: dict[str, Fault] = {}
@@ -264,7 +264,7 @@ def screened_parts(parts: Iterator[Recording]) -> Iterator[Recording]:
 
 
 def _together(found: tuple[Finding, ...], more: Sequence[Finding]) -> tuple[Finding, ...]:
-    """The findings with one more about stamps; one sentence with that of the reader, if it has one."""
+    """The findings with one more about stamps, which is joined with that of the reader, if there is one."""
     said = next((i for i, f in enumerate(found) if f.check == STAMP_CHECK and "records" in f.evidence), None)
     if said is None:
         return (*found, *more)
@@ -280,7 +280,7 @@ def _together(found: tuple[Finding, ...], more: Sequence[Finding]) -> tuple[Find
 
 
 def _streams(recording: Recording) -> Iterator[tuple[str, SignalArray]]:
-    """One array for all that share their stamps, by a name of the stream."""
+    """(name of the stream, one array) for each set of signals that share their stamps."""
     seen: set[int] = set()
     for name, array in recording.signals.items():
         if id(array.time) not in seen:
@@ -289,7 +289,7 @@ def _streams(recording: Recording) -> Iterator[tuple[str, SignalArray]]:
 
 
 def _kept(recording: Recording, before: Mapping[str, Column], after: Recording | None) -> dict[int, NDArray[np.int64]]:
-    """Rows that stay, by the id of the array of stamps; only of streams that lose some."""
+    """Rows to keep, by the id of the array of stamps; only for streams that lose rows."""
     later = {s: a.time[:_NEIGHBOURS] for s, a in _streams(after)} if after is not None else {}
     streams = list(_streams(recording))
     times = [np.concatenate([before.get(s, np.empty(0)), a.time, later.get(s, np.empty(0))]) for s, a in streams]
@@ -308,7 +308,7 @@ def _kept(recording: Recording, before: Mapping[str, Column], after: Recording |
 
 
 def _without(recording: Recording, kept: Mapping[int, NDArray[np.int64]], *, whole: bool) -> Recording:
-    """The recording with these rows alone; of a whole one, without signals of which no row is left."""
+    """The recording with only the rows in `kept`; if `whole`, also without signals that have no rows left."""
     if not kept:
         return recording
     signals = {}
@@ -320,6 +320,6 @@ def _without(recording: Recording, kept: Mapping[int, NDArray[np.int64]], *, who
 
 
 def _close(times: Sequence[Column]) -> bool:
-    """Whether all streams, each in order, lie within the length of a recording."""
+    """Whether all streams together (each in order) are no longer than a recording can be."""
     ends = np.concatenate([time[[0, -1]] for time in times if time.size] or [np.zeros(1)])
     return bool(ends.max() - ends.min() <= LONGEST_RECORDING)

@@ -1,4 +1,4 @@
-"""From tables of firmware variables to signals, a column at a time: what every reader of firmware logs ends with."""
+"""Signals from tables of firmware variables: the last step of every reader of firmware logs."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -28,14 +28,14 @@ class Table(Topic):
     ctypes: Mapping[str, str] = field(default_factory=dict)
 
 
-@np.errstate(invalid="ignore")  # a signalling NaN, as damaged bytes may be, becomes a quiet one by the cast to double
+@np.errstate(invalid="ignore")  # the cast to double turns a signalling NaN (damaged bytes) into a quiet one
 def signals_from_tables(tables: Iterable[Table], *, motor: str | None) -> dict[str, SignalArray]:
-    """Signals by name: those of the vocabulary from their best source, then every other variable under its own name.
+    """Signals by name: first the vocabulary, each from its best source, then all other variables by their own names.
 
     Args:
         tables: of one recording.
-        motor: what motor.m1..4 is: "duty" (PWM sent, after battery compensation), "request" (thrust asked for, before
-            it), or None where nobody knows; then it stays a column without a meaning.
+        motor: meaning of motor.m1..4: "duty" (PWM sent, after battery compensation), "request" (thrust asked for,
+            before compensation), or None if unknown; then motor.m1..4 stay columns without a meaning.
     """
     tables = tuple(tables)
     chosen: dict[str, tuple[_Shared, Source]] = {}
@@ -48,8 +48,8 @@ def signals_from_tables(tables: Iterable[Table], *, motor: str | None) -> dict[s
     used = {(id(where), v) for where, source in chosen.values() for v in source.variables}
     rest = [(where, name) for where in shared for name in where.table.columns if (id(where), name) not in used]
     times = Counter(name for _, name in rest)
-    # room for every vocabulary signal of a row, so that orders are unique and follow the rows; the other variables of a
-    # row were sampled at one instant and no estimator sees them: one place is enough
+    # one place per vocabulary signal in a row makes the orders unique; all other variables share one place, because no
+    # estimator uses them
     step = len(chosen) + 1
     signals: dict[str, SignalArray] = {}
     for place, name in enumerate(n for n in SIGNALS if n in chosen):
@@ -60,7 +60,7 @@ def signals_from_tables(tables: Iterable[Table], *, motor: str | None) -> dict[s
     for where, name in rest:
         value = np.asarray(where.table.columns[name], float)[:, None]
         label = f"{name}@{where.table.name}" if times[name] > 1 or name in SIGNALS else name
-        while label in signals:  # tables of one name
+        while label in signals:  # two tables with the same name
             label += "'"
         signals[label] = where.array(value, len(chosen), step, source=(name,))
     return signals
@@ -72,7 +72,7 @@ def _sources(motor: str | None) -> tuple[Source, ...]:
 
 
 class _Shared:
-    """What all signals of a table have in common, made once: ten minutes at 1 kHz are megabytes of it."""
+    """Arrays that all signals of a table share, made once to save memory."""
 
     def __init__(self, table: Table) -> None:
         self.table = table
@@ -91,10 +91,10 @@ class _Shared:
         source: tuple[str, ...],
         columns: Sequence[NDArray[np.generic]] = (),
     ) -> SignalArray:
-        """A signal of this table; `columns`: what a vocabulary signal was converted from."""
+        """A signal of this table; `columns`: the columns from which a vocabulary signal was converted."""
         marked = self._unmarked
         if columns and not (finite := np.isfinite(value)).all():
-            # a NaN that decoding made of valid values (a rotor speed of 65535 is "missing") is ours, not the file's
+            # marked: the file has valid numbers, the conversion made NaN of them (a rotor speed of 65535: "missing")
             sound = np.logical_and.reduce([np.isfinite(np.asarray(c, float)) for c in columns])
             marked = sound & ~finite.all(axis=1)
         if place not in self._orders:

@@ -1,7 +1,7 @@
-"""The vehicle of a recording, and the signal that it can turn into thrust: one answer for every command, with why not.
+"""The vehicle of a recording and the signal from which its thrust is computed, or the reason why there is none.
 
-`info`, `replay` and `diagnose` use the same signal and refuse for the same reason. `diagnose` may go further: it also
-takes requests and mixer commands, and can do without a voltage.
+`info`, `replay` and `diagnose` use the same signal and refuse for the same reason. `diagnose` accepts more: also
+requests and mixer commands, and recordings without a voltage.
 """
 
 import math
@@ -19,23 +19,23 @@ from crazyem.vehicle import GRAVITY, Vehicle, load_vehicle, preset_names
 
 Array = NDArray[np.float64]
 
-# s between samples of a command or a rotor speed, at most: rotors lag by 30 to 70 ms, so what they did between samples
-# further apart is not known.
+# s; longest interval between samples of a command or rotor speed. Rotors lag by 30 to 70 ms, so their thrust between
+# samples further apart is unknown.
 LONGEST_INPUT_INTERVAL = 0.1
-LARGEST_THRUST_RATIO = 2.0  # of what the vehicle file says of its rotors, above which a sample is no thrust
+LARGEST_THRUST_RATIO = 2.0  # thrust over the largest thrust in the vehicle file; larger samples are left out
 ASSUMED_VOLTAGE = 3.7  # V, where none is logged
-UNKNOWN_VOLTAGE_ERROR = 0.15  # of thrust: a cell between 3.2 and 4.2 V, thrust as its square
+UNKNOWN_VOLTAGE_ERROR = 0.15  # relative error of thrust: a cell has 3.2 to 4.2 V, thrust grows with its square
 FLAT_VOLTAGE_SECONDS = 5.0  # s in the air over which the voltage of a battery changes by more than its resolution
-# Thrust in the air over the vehicle's weight that a payload explains: a Crazyflie of 29 g carries 15 g.
+# Thrust in the air over the weight of the vehicle that a payload can explain: a Crazyflie of 29 g carries 15 g.
 LARGEST_CARRIED_RATIO = 1.5
 _QUADROTOR, _ROTORCRAFT = "2", {"2", "3", "4", "13", "14", "15", "29", "35", "43"}  # MAV_TYPE, of lift by rotors alone
 _THRUST_LAWS = {"rotor_speed": "rotor_constant", "motor_command": "thrust_curve"}
 
 
 def vehicle_for(recording: Recording, given: str | None = None) -> Vehicle:
-    """The vehicle that is named, else the one the recording was flown with, else by what the recording measures.
+    """The given vehicle, else the vehicle stored in the recording, else a vehicle by the signals of the recording.
 
-    That is cf21bl where rotor speeds are measured (brushless motors report them), else cf2.
+    The last is cf21bl if rotor speeds are measured (brushless motors report them), else cf2.
 
     Raises: as `crazyem.physics.folding.load`.
     """
@@ -49,7 +49,7 @@ def vehicle_for(recording: Recording, given: str | None = None) -> Vehicle:
 
 
 def kind_objection(recording: Recording) -> str:
-    """Why the models here are not of this kind of vehicle; "" where they are, or where nobody says what it is."""
+    """Why the models do not fit this kind of vehicle; "" if they fit or the kind is unknown."""
     told = recording.metadata.get("vehicle", {})
     if told.get("mav_type", _QUADROTOR) == _QUADROTOR:
         return ""
@@ -58,12 +58,12 @@ def kind_objection(recording: Recording) -> str:
 
 
 def is_rotorcraft(recording: Recording) -> bool:
-    """Whether rotors alone lift it, as far as anybody says."""
+    """Whether rotors alone lift the vehicle; True if its kind is unknown."""
     return recording.metadata.get("vehicle", {}).get("mav_type", _QUADROTOR) in _ROTORCRAFT
 
 
 def too_slow(recording: Recording, name: str) -> str:
-    """Why a command or rotor speed comes too rarely to say what the rotors did; "" where it does not."""
+    """Why the rate of a command or rotor speed is too low to give the thrust; "" if it is high enough."""
     found = _measured(recording, name)
     if found is None or found[0].size < 3:
         return ""
@@ -75,7 +75,7 @@ def too_slow(recording: Recording, name: str) -> str:
 
 
 def signal_for(recording: Recording, vehicle: Vehicle) -> tuple[str, str]:
-    """The signal that this vehicle turns into thrust and ""; or "" and why there is none, one clause."""
+    """(signal that gives the thrust of this vehicle, ""), or ("", why there is none, one clause)."""
     other = kind_objection(recording)
     if other:
         return "", other
@@ -101,7 +101,7 @@ def signal_for(recording: Recording, vehicle: Vehicle) -> tuple[str, str]:
 
 
 def _measured(recording: Recording, name: str) -> tuple[Array, Array] | None:
-    """Times (n,) and values (n, c) of a signal; None without numbers, or where no sensor is connected (all 0)."""
+    """Times (n,) and values (n, c) of a signal; None without numbers or without a connected sensor (all 0)."""
     array = recording.signals.get(name)
     found = None if array is None else sound_samples(array)
     unconnected = found is not None and name in ("rotor_speed", "voltage") and not found[1].any()
@@ -119,7 +119,7 @@ def _lawless(name: str, vehicle: Vehicle) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inputs:
-    """Commanded wrench: time (n,) s, wrench (n, 4) N and N m, which signal it is from, whether rotor lag is to come."""
+    """Wrench of the rotors: time (n,) s, wrench (n, 4) N and N m, its signal, whether rotor lag must be added."""
 
     time: Array
     wrench: Array
@@ -129,7 +129,7 @@ class Inputs:
 
 
 def flat_voltage(recording: Recording, air: Airtime) -> bool:
-    """Whether the voltage is one number in all of a flight of 5 s or more, as that of a battery never is."""
+    """Whether the voltage is constant in a flight of 5 s or more, which a battery voltage never is."""
     voltage = _measured(recording, "voltage")
     if voltage is None or not air.known or air.seconds < FLAT_VOLTAGE_SECONDS:
         return False
@@ -138,7 +138,7 @@ def flat_voltage(recording: Recording, air: Airtime) -> bool:
 
 
 def inputs_of(recording: Recording, vehicle: Vehicle) -> Inputs | str:
-    """The wrench the estimator would use, or why there is none."""
+    """The wrench for the estimator, or the reason why there is none."""
     name, why = signal_for(recording, vehicle)
     if not name:
         return why
@@ -156,7 +156,7 @@ def inputs_of(recording: Recording, vehicle: Vehicle) -> Inputs | str:
 
 
 def _sane(inputs: Inputs, vehicle: Vehicle) -> Inputs:
-    """Less the samples that claim far more thrust than the rotors have: no rotor did that."""
+    """The inputs without samples of impossibly large thrust and without samples whose time does not increase."""
     good = (inputs.wrench[:, 0] < LARGEST_THRUST_RATIO * 4.0 * vehicle.thrust_max) & (
         np.diff(inputs.time, prepend=-np.inf) > 0
     )
@@ -164,7 +164,7 @@ def _sane(inputs: Inputs, vehicle: Vehicle) -> Inputs:
 
 
 def carried(recording: Recording, vehicle: Vehicle, air: Airtime) -> float:
-    """Median thrust in the air over the vehicle's weight; NaN where the recording cannot say."""
+    """Median thrust in the air over the weight of the vehicle; NaN if unknown."""
     name, _ = signal_for(recording, vehicle)
     inputs = inputs_of(recording, vehicle) if name else ""
     if isinstance(inputs, str) or not inputs.voltage_known or not air.known:
@@ -174,7 +174,7 @@ def carried(recording: Recording, vehicle: Vehicle, air: Airtime) -> float:
 
 
 def weight_objection(recording: Recording, vehicle: Vehicle, air: Airtime) -> str:
-    """A clause where by this vehicle the rotors carry far more or far less than its weight, with the ratio; else ""."""
+    """A clause with the ratio of thrust to weight if it is far from 1 for this vehicle; else ""."""
     ratio = carried(recording, vehicle, air)
     if math.isnan(ratio) or 1.0 / LARGEST_CARRIED_RATIO <= ratio <= LARGEST_CARRIED_RATIO:
         return ""

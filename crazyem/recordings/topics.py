@@ -1,4 +1,4 @@
-"""From topics (named rows of numbers with a time each) to signals: what the readers of ULog, tlog and rosbag2 share."""
+"""Signals from topics (named rows of numbers with times); shared by the readers of ULog, tlog and rosbag2."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import SignalArray
 from crazyem.signals.sample import SIGNALS
 
-# Bounds on columns that nobody mapped: 16 bytes a sample, so some hundred megabytes at most.
+# Bounds on columns without a mapping: 16 bytes per sample, so some hundred megabytes at most.
 MOST_RAW_SIGNALS = 4000
 MOST_RAW_SAMPLES = 24_000_000
 LONGEST_TEXT = 300  # characters of a metadata value that are kept
@@ -41,15 +41,15 @@ class Topic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mapped:
-    """Columns of a topic that are a signal of the vocabulary.
+    """A signal of the vocabulary, made from columns of a topic.
 
     Attributes:
         quantity: key of `SIGNALS`.
         value: (n, c) SI.
-        columns: those it was made of.
-        marked: (n,) True where a NaN is ours because the file calls the value invalid; None: nowhere.
-        frame: what is known of it beyond `SIGNALS`.
-        origin: "" for a candidate to be the signal itself, "mocap" and the like for a further measurement.
+        columns: names of the source columns.
+        marked: (n,) True where the reader set NaN because the file says that the value is invalid; None: nowhere.
+        frame: the frame, if known better than in `SIGNALS`.
+        origin: "" for a candidate for the signal itself, a name such as "mocap" for a further measurement.
     """
 
     quantity: str
@@ -63,13 +63,13 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Columns of a topic that are a signal of the vocabulary: a row of a reader's table, the best source first.
+    """Which columns of a topic give a signal of the vocabulary; a reader has a table of these, the best source first.
 
     Attributes:
-        convert: from c columns of (n,) to (n, c) SI.
-        invalid: (n,) True in rows that the message itself calls invalid; they become missing.
-        absent_is_nan: a NaN is the format's way to say that there is no value.
-        zero_is_absent: columns that are 0 in every row are of a sensor that is not connected; they stay as they are.
+        convert: function from c columns of (n,) to (n, c) SI.
+        invalid: function that returns (n,) True in rows that the message declares invalid; they become missing.
+        absent_is_nan: the format uses NaN for "no value".
+        zero_is_absent: 0 in every row means that no sensor is connected; the columns then stay raw.
         frame, origin: as in `Mapped`.
     """
 
@@ -84,13 +84,13 @@ class Source:
     zero_is_absent: bool = False
 
     def of(self, topics: Sequence[Topic]) -> Iterator[Mapped]:
-        """The signal, from the topic if it is there and has the columns."""
+        """The signal, from each topic that has the name and the columns."""
         for topic in topics:
             if not self.fits(topic) or self.is_absent(topic):
                 continue
             marked = np.zeros(topic.time.size, bool) if self.invalid is None else self.invalid(topic)
             if marked.all() and marked.size:
-                continue  # nothing of it is a value; the columns stay as they are
+                continue  # no valid value; the columns stay raw
             value = self.convert([topic.columns[c] for c in self.columns])
             if marked.any():
                 value = np.where(marked[:, None], np.nan, value)
@@ -99,26 +99,26 @@ class Source:
             yield Mapped(self.quantity, topic, value, self.columns, marked, self.frame, self.origin)
 
     def fits(self, topic: Topic) -> bool:
-        """Whether the topic is the one meant and has the columns."""
+        """Whether the topic has the name and the columns of this source."""
         return topic.name == self.topic and set(self.columns) <= topic.columns.keys()
 
     def is_absent(self, topic: Topic) -> bool:
-        """Whether the topic says by zeros throughout that no sensor is connected."""
+        """Whether zeros in all rows show that no sensor is connected."""
         return self.zero_is_absent and topic.time.size > 0 and not any(topic.columns[c].any() for c in self.columns)
 
 
-# What reads 0 throughout where nothing is connected, in words.
+# Signals that are 0 throughout without a connected sensor, with the reason as text.
 _SENSORS = {"voltage": "no battery monitor is connected", "rotor_speed": "no sensor is connected, or no rotor turned"}
 
 
 def unconnected(
     topics: Sequence[Topic], sources: Sequence[Source], measured: Mapping[str, object]
 ) -> tuple[dict[str, str], list[Finding]]:
-    """Signals that nothing measures although the file has a topic for them: signal -> why, and a finding for each.
+    """Signals that no sensor measures although the file has a topic for them: signal -> why, and a finding for each.
 
     Args:
         topics, sources: of the reader.
-        measured: the signals that the recording has all the same.
+        measured: the signals that the recording has, perhaps from other sources.
     """
     why: dict[str, str] = {}
     for source in sources:
@@ -131,23 +131,23 @@ def unconnected(
 
 
 def named(pattern: str, parts: str) -> tuple[str, ...]:
-    """Column names: the pattern with each of the parts in place of its star."""
+    """Column names: the pattern with its star replaced by each of the parts."""
     return tuple(pattern.replace("*", part) for part in parts.split())
 
 
 def floats(column: NDArray[np.generic]) -> NDArray[np.float64]:
-    """(n,) as float64; any NaN stays one, signalling ones of damaged files too."""
+    """(n,) as float64; NaN stays NaN, also signalling NaN of damaged files."""
     with np.errstate(invalid="ignore"):
         return np.asarray(column, np.float64)
 
 
 def seconds(count: NDArray[np.generic], per_second: float = 1e6) -> NDArray[np.float64]:
-    """(n,) s from whole microseconds (or another part of a second): the nearest double to each."""
+    """(n,) s from whole microseconds (or another fraction of a second), each rounded to the nearest double."""
     return np.asarray(floats(count) / per_second, np.float64)
 
 
 def ranks(times: Sequence[NDArray[np.generic]]) -> list[NDArray[np.int64]]:
-    """Position of each row of each topic when all rows are sorted by time; equal times in the order of the topics."""
+    """Place of each row among the rows of all topics, sorted by time; equal times in the order of the topics."""
     sizes = [t.size for t in times]
     flat = np.concatenate(times) if times else np.empty(0)
     place = np.empty(flat.size, np.int64)
@@ -156,18 +156,18 @@ def ranks(times: Sequence[NDArray[np.generic]]) -> list[NDArray[np.int64]]:
 
 
 def signals_of(topics: Sequence[Topic], mapped: Sequence[Mapped]) -> tuple[dict[str, SignalArray], list[Finding]]:
-    """Signals by name, and what was left out.
+    """Signals by name, and findings about columns that were left out.
 
     Args:
         topics: all of the recording.
         mapped: best first; the first of a quantity gets its name, the others are called "<quantity>@<topic>".
 
-    Returns: vocabulary first, then every column that is in none of them as "<topic>.<column>".
+    Returns: first the signals of the vocabulary, then every unused column as "<topic>.<column>"; and the findings.
     """
     mapped = [m for m in mapped if m.topic.time.size]
     used = {(id(m.topic), column) for m in mapped for column in m.columns}
     raw, left_out = _within_bounds([(t, c) for t in topics for c in t.columns if (id(t), c) not in used])
-    step = len(mapped) + len(raw)  # room for every signal of a row: orders stay unique and follow the rows
+    step = len(mapped) + len(raw)  # places for all signals of a row, so that orders are unique
     unmarked = {id(t): np.zeros(t.time.size, bool) for t in topics}
     hosts = {id(t): np.full(t.time.size, np.nan) if t.host_time is None else t.host_time for t in topics}
     found: dict[str, SignalArray] = {}
@@ -210,7 +210,7 @@ def signals_of(topics: Sequence[Topic], mapped: Sequence[Mapped]) -> tuple[dict[
 
 
 def _within_bounds(raw: list[tuple[Topic, str]]) -> tuple[list[tuple[Topic, str]], list[Finding]]:
-    """As many columns as fit the bounds, the shortest first; in their own order."""
+    """The columns that fit the bounds, chosen from the shortest on, in their original order."""
     place = sorted(range(len(raw)), key=lambda i: raw[i][0].time.size)
     total = 0
     kept = set()
@@ -231,12 +231,12 @@ def _within_bounds(raw: list[tuple[Topic, str]]) -> tuple[list[tuple[Topic, str]
 
 
 def damage(skipped: Sequence[tuple[int, int]], size: int, what: str) -> list[Finding]:
-    """A finding about bytes that are no part of any sound message.
+    """Findings about bytes that belong to no sound message.
 
     Args:
         skipped: (offset, count) of each run, in order.
         size: of the file, bytes.
-        what: a message is called so.
+        what: the word for a message.
     """
     found = []
     cut = [run for run in skipped if sum(run) == size]
@@ -255,7 +255,7 @@ def damage(skipped: Sequence[tuple[int, int]], size: int, what: str) -> list[Fin
 
 
 def text_of(value: object) -> str:
-    """A metadata value: printable and not endless."""
+    """A metadata value as printable text of limited length."""
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
     text = "".join(c if c.isprintable() else " " for c in str(value)[: 4 * LONGEST_TEXT]).strip()
