@@ -1,8 +1,8 @@
-"""Continuing a recording that exists: its summary is made again from its records, and nothing of it is lost.
+"""Continue an existing recording without loss; its summary is rebuilt from its records.
 
-The summary at the end of a finished file says nothing that its chunks do not. So the next session begins where the
-data end, on top of the summary: a crash at any moment leaves a file that is cut off behind complete chunks, which every
-reader of ours takes. The file is changed for the first time by the first write of the new session.
+The summary at the end of a finished file repeats information from its chunks. So the next session overwrites the
+summary and begins where the data end. A crash at any moment leaves a file that ends after complete chunks, which all
+readers here accept. The first write of the new session is the first change of the file.
 """
 
 from dataclasses import dataclass
@@ -20,14 +20,14 @@ from crazyem.recordings.mcap.survey import Part, index_of, parse, parts, profile
 
 @dataclass
 class Continued:
-    """A recording to go on with.
+    """A recording to continue.
 
     Attributes:
-        stream: positioned behind the last complete record. offset: of what is written next, bytes.
-        book: what is in the file so far.
-        sequence: of the last message.
-        log_time: the latest [ns].
-        sessions: that are in the file.
+        stream: positioned after the last complete record. offset: place of the next record [bytes].
+        book: contents of the file so far.
+        sequence: number of the last message.
+        log_time: the latest log time [ns].
+        sessions: number of sessions in the file.
     """
 
     stream: Any
@@ -39,9 +39,9 @@ class Continued:
 
 
 def reopen(path: Path) -> Continued:
-    """A finished or cut-off recording of ours, to be continued.
+    """Open a finished or cut-off recording of crazyem to continue it.
 
-    Raises: FileFormatError if it is not ours, is an imported recording, or is damaged before its end; OSError.
+    Raises: FileFormatError for a file of another program, an imported recording, or damage before the end; OSError.
     """
     with path.open("rb") as head:
         if profile_of(head.read(4096)) != PROFILE:
@@ -64,7 +64,7 @@ def reopen(path: Path) -> Continued:
 
 
 class _Found:
-    """The book of a file, made again from its records."""
+    """The book of a file, rebuilt from its records."""
 
     def __init__(self, book: Book, end: int) -> None:
         self.book, self.end = book, end
@@ -95,7 +95,7 @@ class _Found:
                 self.book.metadata.append(entry)
 
     def close_chunk(self) -> bytes:
-        """Enter the last chunk; returns the index records that should follow it if the file was cut among them."""
+        """Enter the last chunk in the book; returns its index records if the file does not have all of them."""
         part, indexes = self._chunk, self._indexes
         self._chunk, self._indexes = None, {}
         if part is None or part.chunk is None or part.scan is None:
@@ -115,7 +115,7 @@ class _Found:
 
 
 class _Tail:
-    """A file whose bytes from `offset` on give way to `first` and to what is written, once something is."""
+    """A file for writing from `offset` on; the first write cuts the file there and writes `first` before its data."""
 
     def __init__(self, path: Path, offset: int, first: bytes) -> None:
         self._file = path.open("r+b")

@@ -1,4 +1,4 @@
-"""What the messages of our MCAP files add up to: tables of log blocks, streams of signals, events, metadata."""
+"""Collect the messages of MCAP files: tables of log blocks, streams of signals, events, metadata."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,12 +23,12 @@ _KINDS = {schema: kind for kind, (_, schema) in EVENT_TOPICS.items()}
 
 
 class _Rows:
-    """Messages of one channel with fixed length, as they come, taken apart into groups of fields.
+    """Collects the messages of one channel (fixed length) as arrays, one per group of fields.
 
     Args:
         codec: of the messages.
         groups: number of fields in each group, in their order; a group has one type.
-        expected: number of messages, as far as known: saves moving the arrays while they grow.
+        expected: number of messages, if known; saves copies while the arrays grow.
     """
 
     def __init__(self, codec: FixedMessages, groups: Sequence[int], expected: int) -> None:
@@ -44,7 +44,7 @@ class _Rows:
         self._places = GrowingArray(np.int64, expected=expected)
 
     def add(self, data: NDArray[np.uint8], messages: NDArray[np.int64], places: NDArray[np.int64]) -> int:
-        """Take messages (rows of `Scan.messages`) at `places` in the file; returns how many are not sound."""
+        """Take messages (rows of `Scan.messages`) at `places` in the file; returns the number of unsound ones."""
         right = messages[:, 1] == self.codec.size
         rows, sound = self.codec.decode(data, messages[right, 0])
         rows = rows[sound]
@@ -56,7 +56,7 @@ class _Rows:
         return len(messages) - int(sound.sum())
 
     def take(self) -> tuple[list[NDArray[Any]], NDArray[np.int64]]:
-        """(n, fields) values of each group and (n,) places in the file; handed over, not kept."""
+        """(n, fields) values of each group and (n,) places in the file, which are then dropped here."""
         return [array.take() for array in self._arrays], self._places.take()
 
 
@@ -115,10 +115,10 @@ class Content:
     """Takes the parts of a file in order.
 
     Args:
-        expected: number of messages of each channel, as far as known.
+        expected: number of messages of each channel, if known.
 
     Attributes:
-        events: so far; the caller may take them away.
+        events: so far; the caller may remove them.
         metadata: section -> key -> text.
         unreadable: messages that could not be decoded.
         messages: so far.
@@ -154,7 +154,7 @@ class Content:
             self._take_messages(part.scan)
 
     def announce(self, records: Iterable[Any]) -> None:
-        """Schemas and channels; the first word on a number counts as long as it stays the same."""
+        """Take schemas and channels; a repeated channel is ignored, a changed one replaces the old one."""
         for record in records:
             if not hasattr(record, "topic"):
                 self._schemas[record.id] = record.name
@@ -218,20 +218,20 @@ class Content:
             self.unreadable += 1
 
     def tables(self) -> dict[int, list[Table]]:
-        """Session -> tables of its log blocks; their rows are handed over, not kept."""
+        """Session -> tables of its log blocks; the rows are then dropped here."""
         sessions: dict[int, list[Table]] = {}
         for channel in self._blocks.values():
             sessions.setdefault(channel.session, []).append(channel.table())
         return dict(sorted(sessions.items()))
 
     def streams(self) -> dict[str, SignalArray]:
-        """Signals of an imported recording, in its order; their rows are handed over, not kept."""
+        """Signals of an imported recording, in its order; the rows are then dropped here."""
         found = [entry for channel in self._streams.values() for entry in channel.signals()]
         return {name: array for _, name, array in sorted(found, key=lambda e: e[0])}
 
 
 def join(sessions: Iterable[Mapping[str, SignalArray]]) -> dict[str, SignalArray]:
-    """The signals of several sessions, one after the other; a stream that changed is named after both."""
+    """The signals of consecutive sessions, joined; a stream that changes its name gets both names."""
     joined: dict[str, SignalArray] = {}
     after = 0
     for signals in sessions:

@@ -1,4 +1,4 @@
-"""Reading our own recordings (MCAP), whole or cut off: every complete chunk counts, in the order it was written."""
+"""Read recordings of crazyem (MCAP), whole or cut off: all complete chunks, in the order of writing."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,19 +16,19 @@ from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.tables import Table, signals_from_tables
 
-_PART_BYTES = 256 * 1024 * 1024  # unpacked, in one part of `read_parts`, however slowly its clock runs
+_PART_BYTES = 256 * 1024 * 1024  # bytes; largest unpacked size of a part of `read_parts`, at any length in time
 
 
 def recognises(head: bytes) -> bool:
-    """True for MCAP of ours: profile "crazyem", or a damaged header that still says so."""
+    """True for MCAP of crazyem: profile "crazyem", or a damaged header that still contains the word."""
     profile = profile_of(head)
     return profile == PROFILE or (profile is None and head.startswith(MCAP_MAGIC) and b"crazyem" in head[:128])
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
-    """Read one of our recordings; a cut-off or damaged one as far as it goes, which its findings then say.
+    """Read a recording of crazyem; of a cut-off or damaged file all that is readable, with findings about the rest.
 
-    Raises: FileFormatError if it holds no log data of ours.
+    Raises: FileFormatError if the file has no log data of crazyem.
     """
     reading = _Reading(path, options)
     for part in reading.parts():
@@ -40,14 +40,14 @@ def read(path: Path, options: ReadOptions) -> Recording:
 def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Iterator[Recording]:
     """Read a recording of any size in parts, in bounded memory.
 
-    Joined, the parts are what `read` gives: each has the samples and events of at least `seconds` (by log time, chunks
-    are not split), the metadata and findings known by its end; the stamps count from the same origin in all. Only
-    signals that were processed in another order than that of their rows keep the order of processing.
+    The joined parts equal the result of `read`. Each part has the samples and events of at least `seconds` (by log
+    time; chunks are not split), and the metadata and findings known at its end. All parts have the same origin of time.
+    One exception: a signal whose rows are not in processing order comes in processing order.
 
     Raises: as `read`, with the first part.
     """
     reading = _Reading(path, options, in_parts=True)
-    if not reading.announced:  # cut off: without a summary, what is in the file is known only after a look at all of it
+    if not reading.announced:  # cut off, so without a summary: the channels are known only after a pass over the file
         for part in parts(path, []):
             reading.announced.extend(part.announced)
     reading.content.announce(reading.announced)
@@ -85,7 +85,7 @@ class _Reading:
         self._decided: Mapping[str, Mapping[str, str]] = {}
 
     def parts(self) -> Iterator[Part]:
-        # a damaged chunk may have held announcements that the summary repeats
+        # the summary repeats announcements that may be lost in a damaged chunk
         self.content.announce(self.announced)
         return parts(self.path, self.problems)
 
@@ -102,7 +102,7 @@ class _Reading:
         self._sequence = int(numbers[-1])
 
     def check(self) -> None:
-        """Raise FileFormatError if there is nothing in the file that could make a recording."""
+        """Raise FileFormatError if the file has no data for a recording."""
         if not self.content.empty or IMPORT_METADATA in self.content.metadata:
             return
         what = "it holds no log blocks"
@@ -113,7 +113,7 @@ class _Reading:
         raise FileFormatError(f"{self.path} is an MCAP file, but not a usable recording: {what}.")
 
     def recording(self) -> Recording:
-        """What has been taken since the last one."""
+        """The recording of all parts taken since the last call."""
         own = self.content.metadata.get(IMPORT_METADATA)
         sessions = self.content.tables()
         signals = self._signals(sessions)
@@ -138,7 +138,7 @@ class _Reading:
         return join(found)
 
     def _meaning(self, tables: Sequence[Table]) -> str:
-        """What motor.m1..4 is, decided once for a file; where nothing tells, what it was taken for in flight."""
+        """The meaning of motor.m1..4, decided once for a file; without evidence "duty", as in live flight."""
         if self._motor is None:
             decided = decide(tables, given=self.options.motor, metadata=self.content.metadata)
             if any("motor.m1" in table.columns for table in tables):
@@ -157,7 +157,7 @@ class _Reading:
 
 
 def _imported(own: Mapping[str, str] | None) -> tuple[float, str, tuple[Finding, ...]]:
-    """Origin, source and findings of an imported recording; those of a flight of ours without."""
+    """Origin, source and findings of an imported recording; defaults for a flight recorded by crazyem."""
     if own is None:
         return 0.0, "mcap", ()
     try:

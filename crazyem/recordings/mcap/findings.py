@@ -1,4 +1,4 @@
-"""Findings of a reader as JSON text in a recording of ours, exact: a recording that is read again says them again."""
+"""Findings of a reader as exact JSON text in an MCAP file of crazyem, from which they are read back."""
 
 import json
 from collections.abc import Iterable
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.mcap.scan import Loss, Problem
 
-IMPORT_METADATA = "crazyem.signals"  # metadata record of an imported recording that is ours, not the source's
-_MOST_ROWS = 100_000_000  # of a fix; guards against runs that claim anything
+IMPORT_METADATA = "crazyem.signals"  # metadata record that crazyem adds to an imported recording
+_MOST_ROWS = 100_000_000  # rows of a fix; guards against damaged runs
 
 
 def findings_to_json(findings: Iterable[Finding]) -> str:
-    """One text; sample numbers of fixes as runs."""
+    """The findings as one text; the sample numbers of fixes as runs."""
     entries = []
     for finding in findings:
         entry = finding.to_dict()
@@ -40,7 +40,7 @@ def _rows_of_runs(kind: type, value: Any) -> NDArray[np.int64]:
 
 
 def _runs(rows: NDArray[np.int64]) -> list[list[int]]:
-    """[first, beyond the last] of each run of consecutive numbers, in the order given."""
+    """[first, last + 1] of each run of consecutive numbers, in the given order."""
     if not rows.size:
         return []
     breaks = np.flatnonzero(np.diff(rows) != 1) + 1
@@ -49,7 +49,7 @@ def _runs(rows: NDArray[np.int64]) -> list[list[int]]:
 
 
 def finding_of(problem: Problem, *, lost_messages: int | None = None) -> Finding:
-    """What a reader says of bytes that it could not use."""
+    """The finding about bytes that a reader could not use."""
     where = f"byte {problem.offset}"
     evidence = {"offset_byte": float(problem.offset), "lost_byte": float(problem.end - problem.offset)}
     lost = ""

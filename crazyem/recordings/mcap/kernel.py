@@ -1,4 +1,4 @@
-"""Finding the records in an unpacked MCAP chunk, compiled: a recording of a gigabyte has ten million of them."""
+"""Compiled search for the records in an unpacked MCAP chunk; a recording of a gigabyte has ten million records."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ def _number(data, at, size):
 
 @compiled
 def count(data, counts):
-    """Messages and other records into `counts`; -1 where a record does not fit or cannot be in a chunk."""
+    """Write the numbers of messages and other records to `counts`; returns -1 if a record is not valid in a chunk."""
     at = 0
     size = data.size
     while at < size:
@@ -40,7 +40,7 @@ def count(data, counts):
 
 @compiled
 def fill(data, messages, others):
-    """The tables of `Scan`, for data that `count` found sound."""
+    """Fill the tables of `Scan`; `count` must have accepted the data."""
     at = 0
     m = 0
     k = 0
@@ -64,7 +64,7 @@ def fill(data, messages, others):
 
 @compiled
 def gather(data, offsets, rows):
-    """Bytes of messages into rows: as many from each offset as a row is long."""
+    """Copy the bytes from each offset to a row; the length of a row is their number."""
     for i in range(offsets.size):
         for j in range(rows.shape[1]):
             rows[i, j] = data[offsets[i] + j]

@@ -1,7 +1,7 @@
 """Layouts for Foxglove and Lichtblick that show a flight: pose, parameters, residuals, link, motors, voltage.
 
-`flight_layout.json` is the one for a drone and its recording, as the viewers export and import layouts. The one for
-several drones that are streamed live is made of its panels, with /NAME before their topics (live/foxglove.py).
+`flight_layout.json` is the layout for one drone and its recording, in the exchange format of the viewers. The layout
+for several live drones is made of the same panels, with /NAME before their topics (live/foxglove.py).
 """
 
 import json
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from importlib import resources
 from typing import Any
 
-_COLOURS = ("#4e98e2", "#f5774d", "#6ac27c", "#b678d9", "#e2c84e", "#4ed0d0", "#e27fb4", "#9a9a9a")  # one a drone
+_COLOURS = ("#4e98e2", "#f5774d", "#6ac27c", "#b678d9", "#e2c84e", "#4ed0d0", "#e27fb4", "#9a9a9a")  # one per drone
 
 
 def foxglove_layout() -> dict[str, Any]:
@@ -21,12 +21,14 @@ def foxglove_layout() -> dict[str, Any]:
 
 
 def swarm_layout(names: Sequence[str]) -> dict[str, Any]:
-    """The layout of several drones that are streamed live: all in one scene and one tab, and a tab for each.
+    """The layout of several live drones: one scene and one tab for all, and a tab for each drone.
 
-    Tabs do not go into tabs, so a drone's tab shows its panels side by side.
+    Tabs cannot contain tabs, so the tab of a drone shows all its panels side by side.
 
     Args:
-        names: of the drones, as in their topics (/NAME/estimate). Raises ValueError: there are none, or one twice.
+        names: of the drones, as in their topics (/NAME/estimate).
+
+    Raises: ValueError if there are no names or a name occurs twice.
     """
     if not names or len(set(names)) < len(names):
         raise ValueError("a layout needs drones with a name of their own each")
@@ -51,7 +53,7 @@ def swarm_layout(names: Sequence[str]) -> dict[str, Any]:
 
 
 def _together(panel: dict[str, Any], title: str, names: Sequence[str], *, path: str = "") -> dict[str, Any]:
-    """A plot for one drone as one for all of them: one path (the first, if none is named), a colour a drone."""
+    """A plot for all drones from the plot for one: one path (by default the first) and one colour per drone."""
     first = panel["paths"][0]
     paths = [
         {**first, "value": f"/{name}{path or first['value']}", "label": name, "color": _COLOURS[i % len(_COLOURS)]}
@@ -61,7 +63,7 @@ def _together(panel: dict[str, Any], title: str, names: Sequence[str], *, path: 
 
 
 def _of_drone(panel: dict[str, Any], name: str) -> dict[str, Any]:
-    """A panel of the layout for one drone with the name before its topics."""
+    """A panel of the layout for one drone, with the name of the drone before its topics."""
     moved = dict(panel)
     for key in ("topicPath", "topicToRender"):
         if key in panel:
@@ -73,7 +75,7 @@ def _of_drone(panel: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _titles(panel: dict[str, Any], title: str) -> dict[str, Any]:
-    """The title of a panel, under each key under which the panel has one."""
+    """The new title under each title key of the panel."""
     return {key: title for key in ("foxglovePanelTitle", "title") if key in panel}
 
 

@@ -1,4 +1,4 @@
-"""What both writers of our MCAP files share: topics by kind of event, poses for viewers, versions."""
+"""Shared by both writers of MCAP files: topics of events, poses for viewers, versions."""
 
 from importlib import metadata as package_metadata
 from typing import Any
@@ -19,13 +19,13 @@ EVENT_TOPICS: dict[str, tuple[str, str]] = {
 }
 OTHER_EVENT_TOPIC = ("/other_events", "crazyem.Event")
 FINDINGS_TOPIC = "/findings"
-FRAMES_TOPIC = "/mavlink"  # frames as they came, message encoding "mavlink"; for other programs, never read back
+FRAMES_TOPIC = "/mavlink"  # unchanged frames, message encoding "mavlink"; for other programs, never read back
 
 
 def pose_messages(
     nanoseconds: int, translation: dict[str, float], rotation: dict[str, float]
 ) -> list[tuple[str, str, dict[str, Any]]]:
-    """Topic, schema and fields of a pose (m, quaternion body to world), as viewers want it; time since 1970."""
+    """Topic, schema and fields of a pose (m, quaternion body to world) for viewers; time since 1970."""
     stamp = timestamp(nanoseconds)
     pose = {"position": translation, "orientation": rotation}
     frame = {
@@ -46,7 +46,7 @@ def timestamp(nanoseconds: int) -> dict[str, int]:
 
 
 def fields_of(message: Any) -> dict[str, object]:
-    """All fields of a message by name; nested messages as dictionaries, NaN for an echo that never came kept."""
+    """All fields of a message by name; nested messages as dictionaries, NaN is kept (echo that never arrived)."""
     result: dict[str, object] = {}
     for field in message.DESCRIPTOR.fields:
         value = getattr(message, field.name)
@@ -60,7 +60,7 @@ def fields_of(message: Any) -> dict[str, object]:
 
 
 def versions() -> dict[str, str]:
-    """Of the format and of everything that had a part in writing a file."""
+    """Versions of the format and of the packages that write a file."""
     names = ("crazyem", "cflib", "mcap", "numpy")
     return {"format": FORMAT_VERSION, **{name: _version(name) for name in names}}
 

@@ -1,8 +1,8 @@
-"""Writing MCAP records: chunks of bounded size, their indexes, and the summary at the end; also into an existing file.
+"""Write MCAP records: chunks of bounded size, their indexes, and the summary; also into an existing file.
 
-Like mcap.writer, and with its record types, but chunks never grow beyond their limit, whole arrays of messages are
-written at once, schemas and channels are repeated every few chunks (so that a damaged chunk takes nothing with it), and
-a file can be continued.
+Differences to mcap.writer, whose record types are used: chunks stay below their limit, whole arrays of messages are
+written at once, a file can be continued, and schemas and channels are repeated every few chunks (so that a damaged
+chunk does not make other chunks unreadable).
 """
 
 import errno
@@ -43,11 +43,11 @@ ANNOUNCE_EVERY = 20  # chunks
 
 @dataclass
 class Book:
-    """What the summary of a file says: kept while writing, or made again from a file.
+    """Contents of the summary of a file: collected while writing, or rebuilt from a file.
 
     Attributes:
         schemas, channels: by identifier.
-        chunks, attachments, metadata: where they are in the file.
+        chunks, attachments, metadata: index entries with places in the file.
         counts: messages of each channel.
         start, end: log times of the first and last message [ns], None without messages.
     """
@@ -62,7 +62,7 @@ class Book:
     end: int | None = None
 
     def announce(self, record: Schema | Channel) -> None:
-        """A schema or channel that stands in the file; the first word on a number counts."""
+        """Enter a schema or channel of the file; the first one with a number counts."""
         known: dict[int, Any] = self.channels if isinstance(record, Channel) else self.schemas
         known.setdefault(record.id, record)
 
@@ -77,10 +77,10 @@ class Output:
     """An MCAP file being written.
 
     Args:
-        stream: opened for writing, positioned where the next record goes; stays open.
-        book, offset: of a file that is continued: what is in it, and the place [bytes] of the next record.
+        stream: opened for writing, at the place of the next record; stays open.
+        book, offset: of a continued file: its contents and the place of the next record [bytes].
 
-    Raises: OSError from the stream, as it comes.
+    Raises: OSError of the stream.
     """
 
     def __init__(self, stream: BinaryIO, *, book: Book | None = None, offset: int = 0) -> None:
@@ -88,7 +88,7 @@ class Output:
         self._stream, self._offset = stream, offset
         self._buffer = bytearray()
         self._index: dict[int, list[tuple[int, int]]] = {}
-        self._since = 0  # chunks since everything was announced
+        self._since = 0  # chunks since the last repetition of all announcements
 
     def _put(self, data: bytes) -> None:
         self._stream.write(data)
@@ -124,11 +124,11 @@ class Output:
         return b"".join(map(_bytes, (*self.book.schemas.values(), *self.book.channels.values())))
 
     def announce_again(self) -> None:
-        """Put everything announced so far in front of the next chunk's messages."""
+        """Repeat all announcements before the messages of the next chunk."""
         self._buffer[:] = self._announcements()
 
     def flush_announcements(self) -> None:
-        """What waits to be announced goes out in records of its own, before a chunk that is copied."""
+        """Write waiting announcements as records outside chunks, before a copied chunk."""
         if not self._index and self._buffer:
             self._put(bytes(self._buffer))
             self._buffer.clear()
@@ -136,7 +136,7 @@ class Output:
     # --- messages -----------------------------------------------------------------------------------------------
 
     def message(self, channel: int, log_time: int, data: bytes, *, sequence: int, publish_time: int) -> None:
-        """One message; times in ns since the epoch. Closes the chunk before it, if it would grow too large."""
+        """Write a message; times in ns since the epoch. Closes the chunk first if it would become too large."""
         head = MESSAGE_HEAD.pack(MESSAGE, 22 + len(data), channel, sequence & 0xFFFFFFFF, log_time, publish_time)
         record = head + data
         if self._index and len(self._buffer) + len(record) > CHUNK_BYTES:
@@ -145,10 +145,10 @@ class Output:
         self._buffer += record
 
     def messages(self, packed: bytes, index: Mapping[int, NDArray[np.uint64]]) -> None:
-        """A chunk of messages made elsewhere.
+        """Write a chunk of ready message records.
 
         Args:
-            packed: message records, one after the other.
+            packed: consecutive message records.
             index: channel -> (n, 2) log time [ns] and offset in `packed` of each of its messages.
         """
         self.flush()
@@ -158,7 +158,7 @@ class Output:
         self._close_chunk({channel: pairs + shift for channel, pairs in index.items()})
 
     def _place(self) -> int:
-        """Offset of the next message in the chunk; repeats the announcements first where that is due."""
+        """Offset of the next message in the chunk; first repeats the announcements if due."""
         if not self._index and self._since >= ANNOUNCE_EVERY:
             announcements = self._announcements()
             if len(announcements) <= CHUNK_BYTES // 4:
@@ -173,10 +173,10 @@ class Output:
         return max(1, CHUNK_BYTES - max(waiting, len(self._announcements()) if self._since >= ANNOUNCE_EVERY else 0))
 
     def flush(self, *, sync: bool = False) -> None:
-        """Close the chunk in progress, if it has messages, and hand everything to the operating system.
+        """Close the current chunk, if it has messages, and pass all data to the operating system.
 
         Args:
-            sync: wait until it is on the disk.
+            sync: wait until the data are on the disk.
         """
         if self._index:
             self._close_chunk({c: np.array(pairs, np.uint64) for c, pairs in self._index.items()})
@@ -198,9 +198,9 @@ class Output:
     def chunk(
         self, compression: str, packed: bytes, *, size: int, crc: int, index: Mapping[int, NDArray[np.uint64]]
     ) -> None:
-        """A chunk as it stands, with the index of its messages (as in `messages`, offsets in the unpacked chunk).
+        """Write a packed chunk, with the index of its messages (as in `messages`, offsets in the unpacked chunk).
 
-        Everything it needs must have been announced, or stand in it.
+        Its schemas and channels must be announced already, or be in the chunk.
         """
         start, end = _span(index)
         record = _bytes(Chunk(compression, packed, end, start, uncompressed_crc=crc, uncompressed_size=size))
@@ -212,13 +212,13 @@ class Output:
     # --- beside the chunks --------------------------------------------------------------------------------------
 
     def metadata(self, name: str, entries: Mapping[str, str]) -> None:
-        """A metadata record: it goes into the file at once, before the chunk in progress."""
+        """Write a metadata record at once, before the current chunk."""
         record = _bytes(Metadata(name=_text(name), metadata={_text(k): _text(v) for k, v in entries.items()}))
         self.book.metadata.append(MetadataIndex(offset=self._offset, length=len(record), name=_text(name)))
         self._put(record)
 
     def attachment(self, record: Attachment) -> None:
-        """An attachment, at once like metadata."""
+        """Write an attachment at once."""
         data = _bytes(record)
         entry = AttachmentIndex(
             offset=self._offset,
@@ -233,7 +233,7 @@ class Output:
         self._put(data)
 
     def finish(self) -> None:
-        """Everything that waits, then the summary; the file is complete."""
+        """Write all waiting data and the summary; the file is then complete."""
         self.flush()
         self._put(_bytes(DataEnd(0)))
         self._put(_summary(self.book, self._offset) + MCAP_MAGIC)
@@ -250,7 +250,7 @@ def note_chunk(
     index: Mapping[int, NDArray[np.uint64]],
     indexes: Mapping[int, bytes],
 ) -> None:
-    """Enter a chunk at `offset` into the book, whose index records (`indexes`) follow it in this order."""
+    """Enter a chunk at `offset` in the book; its index records follow the chunk in the order of `indexes`."""
     start, end = _span(index)
     places, at = {}, offset + length
     for channel, record in indexes.items():
@@ -325,5 +325,5 @@ def _bytes(record: McapRecord) -> bytes:
 
 
 def _text(value: object) -> str:
-    """Text that UTF-8 can hold: file names may contain bytes that are none."""
+    """Valid UTF-8 text: file names may contain other bytes."""
     return str(value).encode("utf-8", "replace").decode("utf-8")

@@ -1,4 +1,4 @@
-"""A broken MCAP file into a new, valid one: every complete chunk, whatever program wrote it."""
+"""Recover a damaged MCAP file of any program: copy every complete chunk to a new, valid file."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,12 +18,12 @@ from crazyem.recordings.mcap.survey import Part, from_summary, index_of, parse, 
 
 @dataclass
 class Report:
-    """What became of a file.
+    """Result of a recovery.
 
     Attributes:
         profile: of the file, "" if its header is damaged.
-        messages, chunks, metadata, attachments: what was recovered.
-        lost_messages: as the sequence numbers tell; None for a file of another program.
+        messages, chunks, metadata, attachments: numbers of recovered records.
+        lost_messages: by the sequence numbers; None for a file of another program.
         problems: the bytes that could not be used, by offset.
         closed: whether the file was complete.
     """
@@ -58,10 +58,10 @@ class Report:
 
 
 def recover(source: str | Path, target: str | Path, *, replace: bool = False) -> Report:
-    """Write all that can be read of an MCAP file into a new one, with its index and statistics made anew.
+    """Write all readable data of an MCAP file to a new file, with new index and statistics.
 
     Args:
-        source: of any profile; only read.
+        source: a file of any profile; it is not changed.
         target: another file.
         replace: an existing target may be replaced.
 
@@ -90,7 +90,7 @@ def _copy(source: Path, head: bytes, output: Output) -> Report:
     profile = profile_of(head)
     report = Report(profile=profile or "")
     output.start(report.profile, "crazyem recover")
-    # a damaged chunk may have held announcements that only the summary repeats
+    # the summary repeats announcements that may be lost in a damaged chunk
     known = {(type(r).__name__, r.id): r for r in from_summary(source)[0]}
     counter = _Sequence()
     seen: set[tuple[str, int]] = set()
@@ -118,7 +118,7 @@ def _copy(source: Path, head: bytes, output: Output) -> Report:
 
 
 def _restore(output: Output, part: Part, known: dict[tuple[str, int], Any], seen: set[tuple[str, int]]) -> None:
-    """Announce what the messages of this part need and nothing before has announced, from the summary."""
+    """Announce, from the summary, channels and schemas that this part needs and no earlier part has announced."""
     assert part.scan is not None
     needed = []
     for channel in set(part.scan.messages[:, 2].tolist()):
@@ -137,12 +137,12 @@ def _restore(output: Output, part: Part, known: dict[tuple[str, int], Any], seen
 
 
 def _messages(output: Output, part: Part, report: Report) -> None:
-    """A chunk goes over as it stands, byte for byte; records outside chunks into chunks."""
+    """Copy a chunk byte for byte; records outside chunks are written as a chunk."""
     assert part.scan is not None
     messages = part.scan.messages
     book = output.book
     known = [c.id for c in book.channels.values() if c.schema_id == 0 or c.schema_id in book.schemas]
-    defined = np.isin(messages[:, 2], known)  # messages that a reader can decode, as far as announced
+    defined = np.isin(messages[:, 2], known)  # messages of announced channels, which a reader can decode
     if not defined.all():
         why = f"{int((~defined).sum())} messages of channels that nothing announces any more"
         report.problems.append(Problem(Loss.DAMAGED, part.record.offset, part.record.end, why))
@@ -164,7 +164,7 @@ def _messages(output: Output, part: Part, report: Report) -> None:
 
 
 def _rewrite(output: Output, scan: Scan, messages: NDArray[np.int64]) -> None:
-    """Some messages of a chunk into another."""
+    """Write some messages of a chunk to a new chunk."""
     records = [scan.data[offset - 31 : offset + length].tobytes() for offset, length, *_ in messages.tolist()]
     if records:
         packed = b"".join(records)
@@ -183,7 +183,7 @@ def _attachment(source: Path, part: Part, output: Output) -> int:
 
 
 class _Sequence:
-    """Counts what is missing in the sequence numbers of our recordings, which run through the whole file."""
+    """Counts lost messages by sequence numbers, which are consecutive in a whole file of crazyem."""
 
     def __init__(self) -> None:
         self.newest = 0

@@ -1,8 +1,8 @@
-"""Walking through an MCAP file record by record, whole or damaged: what stands where, and which bytes are lost.
+"""Read a whole or damaged MCAP file record by record; locate lost bytes.
 
-Nothing is believed that the file claims: lengths are checked against the file and against each other, chunks are
-unpacked into a bounded buffer and checked against their CRC. After a stretch that makes no sense the walk goes on at
-the next chunk. Format: https://mcap.dev/spec (version 0).
+The reader trusts no number in the file: it checks lengths against the file and against each other, unpacks chunks into
+a bounded buffer and checks their CRC. After invalid bytes it continues at the next chunk.
+Format: https://mcap.dev/spec (version 0).
 """
 
 import re
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
-LARGEST_CHUNK = 64 * 1024 * 1024  # bytes unpacked; ours have a quarter MiB, a damaged length claims anything
+LARGEST_CHUNK = 64 * 1024 * 1024  # bytes unpacked; chunks of crazyem have a quarter MiB, damaged lengths may be huge
 LARGEST_RECORD = 64 * 1024 * 1024  # bytes of any record but chunks and attachments
 MOST_DEFINITIONS = 100_000  # schemas and channels in one chunk; no sound file has more
 
@@ -37,13 +37,13 @@ class Loss(StrEnum):
     """Why bytes of a file could not be used."""
 
     CUT = "cut"  # the file ends in the middle of a record
-    DAMAGED = "damaged"  # bytes are not what was written
-    OPEN = "open"  # nothing is missing but the end: the writer was stopped
+    DAMAGED = "damaged"  # bytes have changed since they were written
+    OPEN = "open"  # only the end is missing: the writer was stopped
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Bytes `offset` to `end` of the file could not be used, and why."""
+    """Bytes `offset` to `end` of the file that could not be used, with the reason."""
 
     loss: Loss
     offset: int
@@ -53,7 +53,7 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """A record at the top level of a file: where it starts, where the next one does, what is in it.
+    """A record at the top level of a file: its offset, the offset of the next record, and its content.
 
     The content of attachments is left out: `data` is empty.
     """
@@ -93,9 +93,9 @@ class Scan:
 
 
 def records(stream: BinaryIO, problems: list[Problem]) -> Iterator[Record]:
-    """The records between the magic bytes, those of the summary included; what cannot be read goes to `problems`.
+    """The records between the magic bytes, with the summary; unreadable bytes are appended to `problems`.
 
-    Chunks are checked for consistent lengths only; `unpack` checks the rest.
+    Only the lengths in chunks are checked here; `unpack` checks the rest.
     """
     size = stream.seek(0, 2)
     offset = len(MCAP_MAGIC)
@@ -145,12 +145,12 @@ def _plausible(opcode: int, length: int) -> bool:
 
 
 def _consistent(opcode: int, data: bytes) -> bool:
-    """Whether the lengths inside a record add up to the record's."""
+    """Whether the lengths inside a record agree with the length of the record."""
     try:
         if opcode == CHUNK:
             parse_chunk(data)
         elif _is_chunk(data):
-            return False  # of a chunk only the opcode is damaged
+            return False  # a chunk with a damaged opcode
         elif opcode == MESSAGE_INDEX:
             return len(data) >= 6 and int.from_bytes(data[2:6], "little") == len(data) - 6
         elif opcode == METADATA:
@@ -174,7 +174,7 @@ def _is_chunk(data: bytes) -> bool:
 
 
 def _next_chunk(stream: BinaryIO, offset: int, size: int) -> int | None:
-    """Offset of the next chunk record that lies wholly in the file and whose lengths agree; None if there is none."""
+    """Offset of the next complete chunk record with consistent lengths; None if there is none."""
     overlap = 64
     while offset < size:
         stream.seek(offset)
@@ -227,7 +227,7 @@ def unpack(chunk: PackedChunk) -> bytes:
 def _unpack_zstd(chunk: PackedChunk) -> bytes:
     import zstandard
 
-    # one byte more than claimed shows a chunk that is larger than it says, without unpacking the rest
+    # reading one byte more than the claimed size detects a larger chunk without unpacking all of it
     try:
         with zstandard.ZstdDecompressor(max_window_size=2 * LARGEST_CHUNK).stream_reader(
             chunk.packed, read_across_frames=True

@@ -1,8 +1,8 @@
-"""The protobuf messages of our MCAP files, without generated code; every viewer can decode them.
+"""The protobuf messages of MCAP files, without generated code; every viewer can decode them.
 
-Log packets have one message type a block, with one field a variable, and are packed and unpacked by `struct`: all their
-fields are 8 bytes wide, so a message has a fixed length and costs about a microsecond. Every other message is in
-messages.textproto and goes through google.protobuf.
+Log packets have one message type per block and one field per variable. `struct` packs and unpacks them: all fields have
+8 bytes, so a message has a fixed length and takes about a microsecond. All other messages are defined in
+messages.textproto and use google.protobuf.
 """
 
 import functools
@@ -38,7 +38,7 @@ def message_class(name: str) -> Any:
 
 @functools.cache
 def schema_data(name: str) -> bytes:
-    """The serialised FileDescriptorSet of a message, dependencies included, as MCAP wants it."""
+    """The serialised FileDescriptorSet of a message, dependencies included, as MCAP requires."""
     by_name = {file.name: file for file in _files()}
     wanted: list[Any] = []
 
@@ -53,10 +53,10 @@ def schema_data(name: str) -> bytes:
 
 
 class BlockCodec:
-    """Messages of one log block: `firmware_time_ms`, `host_time`, then one double a variable.
+    """Messages of one log block: `firmware_time_ms`, `host_time`, then one double per variable.
 
-    Every firmware value (integers of up to 32 bits, float, half) is exact in a double, so the packet comes back bit
-    for bit. Raises ValueError where bytes are not such a message.
+    A double holds every firmware value (integers of up to 32 bits, float, half) exactly, so decoding returns the same
+    packet bit for bit. Raises ValueError if bytes are not such a message.
     """
 
     def __init__(self, block: Block) -> None:
@@ -87,7 +87,7 @@ class BlockCodec:
         return dynamic_schema("crazyem.log", self.schema_name.rsplit(".", 1)[1], fields)
 
     def metadata(self) -> dict[str, str]:
-        """What the channel says of the block: enough to decode it without any other record."""
+        """Metadata of the channel, sufficient to decode the block without any other record."""
         block = self.block
         variables = json.dumps([[v.name, v.ctype] for v in block.variables])
         return {"identifier": str(block.identifier), "period_ms": str(block.period_ms), "variables": variables}
@@ -100,7 +100,7 @@ def block_from_metadata(metadata: dict[str, str]) -> Block:
 
 
 def dynamic_schema(package: str, name: str, fields: Iterable[tuple[str, str]]) -> bytes:
-    """The serialised FileDescriptorSet of a message made up at run time, from (field, type) in order."""
+    """The serialised FileDescriptorSet of a message that is defined at run time, from (field, type) in order."""
     message = descriptor_pb2.DescriptorProto(name=name)
     for number, (field, kind) in enumerate(fields, start=1):
         message.field.add(name=field, number=number, label=_F.LABEL_OPTIONAL, type=_TYPES[kind])
@@ -111,7 +111,7 @@ def dynamic_schema(package: str, name: str, fields: Iterable[tuple[str, str]]) -
 
 
 def tag(number: int, wire_type: int) -> bytes:
-    """The bytes before a field."""
+    """The tag bytes before a field."""
     key, data = number << 3 | wire_type, bytearray()
     while key >= 0x80:
         data.append(key & 0x7F | 0x80)

@@ -1,7 +1,7 @@
-"""Writing any recording as MCAP of ours: one channel a stream, its signals exact, in the order of processing.
+"""Write any recording as MCAP of crazyem: one channel per stream, exact signals, in processing order.
 
-What `mcap.file.read` makes of it is the same recording: times, values, host times and marks bit for bit, units, frames,
-clocks and sources, events, findings and metadata. docs/reference/formats/mcap.md has the channels.
+`mcap.file.read` returns the same recording: times, values, host times and marks bit for bit; units, frames, clocks and
+sources; events, findings and metadata. docs/reference/formats/mcap.md describes the channels.
 """
 
 import json
@@ -34,12 +34,12 @@ from crazyem.recordings.mcap.stream_codec import MOST_FIELDS, MOST_SIGNALS, Colu
 from crazyem.recordings.recording import Event, Recording, SignalArray
 from crazyem.recordings.topics import ranks
 
-_EPOCH_RANGE = (9.0e8, 4.2e9)  # s: stamps between 1998 and 2103 are taken for times since 1970
+_EPOCH_RANGE = (9.0e8, 4.2e9)  # s; stamps between 1998 and 2103 count as times since 1970
 _LOG_LEVELS = {Grade.HARMLESS: 2, Grade.DEGRADES: 3, Grade.UNUSABLE: 4}  # of foxglove.Log
 
 
 def write_recording(recording: Recording, path: str | Path, *, replace: bool = False) -> None:
-    """Write a recording as MCAP, whole or not at all.
+    """Write a recording as MCAP, completely or not at all.
 
     Args:
         recording: from any reader.
@@ -91,7 +91,7 @@ class _Group:
         return sum(array.value.shape[1] for array in self.arrays)
 
     def takes(self, array: SignalArray, rank: NDArray[np.int64]) -> bool:
-        """Whether `array` belongs into the same messages, after those that are here."""
+        """Whether `array` fits into the same messages, after the present arrays."""
         if len(self.arrays) >= MOST_SIGNALS or self.width + array.value.shape[1] > MOST_FIELDS:
             return False
         mine = self.arrays[0]
@@ -115,7 +115,7 @@ def _groups(signals: Mapping[str, SignalArray], places: Mapping[str, NDArray[np.
     groups: list[_Group] = []
     for name in sorted(signals, key=lambda n: (int(places[n][0]) if places[n].size else -1, index[n])):
         array = signals[name]
-        # the newest group of a stream only: its neighbours in the processing order come one after the other
+        # only the newest group of a stream: its signals are neighbours in the processing order
         newest = next((g for g in reversed(groups) if g.stream == array.stream), None)
         if newest is None or not newest.takes(array, places[name]):
             newest = _Group(array.stream)
@@ -132,7 +132,7 @@ class _Stream:
 
     def __init__(self, output: Output, group: _Group) -> None:
         taken = {topic.removeprefix("/signals/") for topic in (c.topic for c in output.book.channels.values())}
-        # rows in processing order; where that is not the order of the arrays, messages say which row they are
+        # rows in processing order; if the arrays have another order, each message contains its row
         self.rows = np.argsort(group.base, kind="stable")
         shuffled = not np.array_equal(self.rows, np.arange(self.rows.size))
         self.arrays = group.arrays
@@ -175,7 +175,7 @@ def _components(array: SignalArray) -> tuple[str, ...]:
 
 
 class _Clock:
-    """Log times [ns]: the host's where known, else the source's if it counts from 1970, else from the first sample."""
+    """Log times [ns]: host times if known, else source times since 1970, else source times shifted to be >= 0."""
 
     def __init__(self, recording: Recording, streams: Sequence[_Stream]) -> None:
         times = [s.arrays[0].time for s in streams if s.arrays[0].time.size]
@@ -185,13 +185,13 @@ class _Clock:
         self.shift = recording.origin if epoch else -min(least, 0.0)
 
     def of(self, time: NDArray[np.float64], host_time: NDArray[np.float64]) -> NDArray[np.float64]:
-        """ns, NaN where not known."""
-        with np.errstate(over="ignore", invalid="ignore"):  # absurd stamps become infinite; writing clips them
+        """Log times [ns], NaN if unknown."""
+        with np.errstate(over="ignore", invalid="ignore"):  # huge stamps become infinite and are clipped when written
             return (host_time if self.host_known else time + self.shift) * 1e9
 
 
 class _Extra:
-    """A message of its own: `key` is where it belongs among the samples, NaN: by its `log_time` [ns, 0: unknown]."""
+    """A message beside the samples; `key` is its place among them, NaN: placed by its `log_time` [ns, 0: unknown]."""
 
     def __init__(self, channel: int, data: bytes, *, key: float = math.nan, log_time: int, publish: int = -1) -> None:
         self.channel, self.data, self.key = channel, data, key
@@ -227,7 +227,7 @@ class _Merge:
         self.log_times = _running(time[order])
 
     def write(self) -> None:
-        """Chunk by chunk; sequence numbers count through the file."""
+        """Write all chunks; sequence numbers are consecutive in the file."""
         ends = np.cumsum(self.sizes)
         done = np.zeros(len(self.streams) + 1, np.int64)
         first, start = 0, 0
@@ -317,7 +317,7 @@ def _poses(
         time = float(position.time[row])
         if not abs(time - newest) >= POSE_PERIOD:
             continue
-        # the attitude known by then; the sample after the position if it was taken at the same time
+        # the latest attitude at the position, or the next sample in processing order
         at = int(np.searchsorted(known, places["position"][row] + 1, side="right")) - 1
         if at < 0 or not np.isfinite(position.value[row]).all():
             continue
@@ -334,7 +334,7 @@ def _poses(
 
 
 def _events(output: Output, recording: Recording, clock: _Clock) -> list[_Extra]:
-    """Events as messages of their kind where that holds all of them, else as JSON."""
+    """Events as messages of their own kind if this is lossless, else as JSON."""
     extras = []
     for event in recording.events:
         found = _native(event)
@@ -350,7 +350,7 @@ def _events(output: Output, recording: Recording, clock: _Clock) -> list[_Extra]
 
 
 def _native(event: Event) -> tuple[str, str, bytes] | None:
-    """The event as a message of its own kind, None if that would lose anything of it."""
+    """The event as a message of its own kind, None if this would lose data."""
     if event.kind not in EVENT_TOPICS or _nanoseconds(event.time) / 10**9 != event.time:
         return None
     topic, schema = EVENT_TOPICS[event.kind]
@@ -364,12 +364,12 @@ def _native(event: Event) -> tuple[str, str, bytes] | None:
 
 
 def _nanoseconds(seconds: float) -> int:
-    """Exact, within what a log time can hold; 0 for no number."""
+    """Seconds as exact ns, clipped to the range of log times; 0 for NaN or infinity."""
     return min(max(round(Fraction(seconds) * 10**9), 0), 2**63 - 1) if math.isfinite(seconds) else 0
 
 
 def _notes(output: Output, recording: Recording) -> list[_Extra]:
-    """Findings as log lines, for viewers; they are read back from the metadata."""
+    """Findings as log messages for viewers; the reader uses those in the metadata."""
     extras = []
     for finding in recording.findings:
         fields = {

@@ -1,7 +1,7 @@
-"""Messages of fixed length, all fields eight bytes wide: arrays to protobuf bytes and back, a column at a time.
+"""Messages of fixed length with fields of eight bytes: arrays to protobuf bytes and back, column by column.
 
-Two kinds of channels use them: log blocks as flown (schemas.BlockCodec) and signals of an imported recording
-(`StreamLayout`). A protobuf decoder reads either; here they are a numpy record array with tags between the fields.
+Two kinds of channels use them: log blocks of a flight (schemas.BlockCodec) and signals of an imported recording
+(`StreamLayout`). Every protobuf decoder can read them; here they are a numpy record array with tags between the fields.
 """
 
 import json
@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 from crazyem.recordings.mcap import schemas
 from crazyem.signals.sample import Block
 
-MOST_SIGNALS = 60  # in one message, a bit each in `marked`
-MOST_FIELDS = 4096  # in one message; guards against metadata that claim anything
+MOST_SIGNALS = 60  # in one message; each has a bit in `marked`
+MOST_FIELDS = 4096  # in one message; guards against damaged metadata
 
 
 class FixedMessages:
     """Messages whose fields are all doubles or 64-bit integers and all present.
 
     Args:
-        kinds: numpy type of each field, "<f8", "<i8" or "<u8"; numbered from 1.
+        kinds: numpy type of each field, "<f8", "<i8" or "<u8"; fields are numbered from 1.
     """
 
     def __init__(self, kinds: Sequence[str]) -> None:
@@ -47,7 +47,7 @@ class FixedMessages:
         self._tags = np.flatnonzero(fixed)
 
     def encode(self, columns: Sequence[NDArray[Any]]) -> NDArray[np.uint8]:
-        """(n, size) bytes of n messages, from one (n,) array a field."""
+        """(n, size) bytes of n messages, from one (n,) array per field."""
         count = len(columns[0])
         rows = np.empty((count, self.size), np.uint8)
         rows[:] = self._blank
@@ -57,9 +57,9 @@ class FixedMessages:
         return rows
 
     def decode(self, data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """(n,) record array with fields "0", "1", ... of the messages at `offsets`, and which of them are sound.
+        """(n,) record array with fields "0", "1", ... of the messages at `offsets`, and (n,) True for sound messages.
 
-        Every offset must have a whole message behind it.
+        A whole message must follow every offset.
         """
         rows = np.empty((offsets.size, self.size), np.uint8)
         if offsets.size:
@@ -77,11 +77,11 @@ def block_messages(block: Block) -> FixedMessages:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A signal in a stream: what `SignalArray` says of it.
+    """A signal in a stream, described as in `SignalArray`.
 
     Attributes:
-        index: its place among the signals of the recording.
-        components: their names; in a file, those of the fields of its messages.
+        index: place among the signals of the recording.
+        components: names of the components; in a file, names of the fields.
     """
 
     name: str
@@ -107,7 +107,7 @@ class StreamLayout:
         identifier: a protobuf name, unique in the file.
         stream: as in `SignalArray`.
         signals: in processing order.
-        rows: messages carry their row in the arrays, where that is not the order in which they were processed.
+        rows: messages contain their row in the arrays, because it differs from the processing order.
     """
 
     identifier: str
@@ -145,7 +145,7 @@ class StreamLayout:
         return schemas.dynamic_schema("crazyem.signals", self.identifier, self.fields())
 
     def metadata(self) -> dict[str, str]:
-        """What the channel says of its signals, enough to make them again."""
+        """Metadata of the channel, sufficient to read its signals back."""
         names = iter([name for name, _ in self.fields()[self.first :]])
         signals = [replace(s, components=tuple(next(names) for _ in s.components)) for s in self.signals]
         text = json.dumps([asdict(s) for s in signals])
@@ -153,7 +153,7 @@ class StreamLayout:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> "StreamLayout":
-        """Inverse of `metadata`, of what reading needs. Raises ValueError or KeyError on anything else."""
+        """Inverse of `metadata`, as far as reading needs. Raises ValueError or KeyError on anything else."""
         columns = msgspec.json.decode(metadata["signals"], type=tuple[Column, ...])
         if not columns or len(columns) > MOST_SIGNALS or sum(c.width for c in columns) > MOST_FIELDS:
             raise ValueError("not a stream of signals")
@@ -161,11 +161,11 @@ class StreamLayout:
 
 
 def unique_name(text: str, taken: set[str]) -> str:
-    """A protobuf identifier that looks like `text`, and is none of `taken` (to which it is added) however spelt."""
+    """A protobuf identifier similar to `text` that differs from all in `taken`; it is added to `taken`."""
     name = re.sub(r"[^A-Za-z0-9_]+", "_", text).strip("_") or "x"
     name = f"x{name}" if name[0].isdigit() else name
     candidate, number = name, 1
-    # JSON names of protobuf fields drop underscores and capitals: two fields must differ in those as well
+    # JSON names of protobuf fields have no underscores and change capitals: names must differ without these too
     keys = {_key(t) for t in taken}
     while _key(candidate) in keys:
         number += 1

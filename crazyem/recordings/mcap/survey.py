@@ -1,4 +1,4 @@
-"""What an MCAP file holds, part by part: chunks unpacked and checked, announcements parsed, losses located."""
+"""The contents of an MCAP file, part by part: unpacked and checked chunks, schemas and channels, losses."""
 
 import io
 import zlib
@@ -14,20 +14,20 @@ from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings.mcap import scan as mcap_scan
 from crazyem.recordings.mcap.scan import HEAD, MCAP_MAGIC, MESSAGE_HEAD, Loss, PackedChunk, Problem, Record, Scan
 
-# a file that unpacks to more than this many times its size (and 64 MiB) is a bomb; flights have 2 to 5
+# unpacked size over file size (beyond 64 MiB); more is a decompression bomb, flights have 2 to 5
 LARGEST_UNPACKED_RATIO = 100
-_BATCH_BYTES = 256 * 1024  # bytes of records outside chunks that are looked at together
+_BATCH_BYTES = 256 * 1024  # bytes of records outside chunks that form one part
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A chunk, or records that stand outside of chunks.
+    """A chunk, or records outside chunks.
 
     Attributes:
         record: the first record.
         scan: messages of a chunk or of a run of records outside chunks; None for anything else.
-        chunk: the chunk as it stands in the file, None outside chunks.
-        announced: schemas and channels in it (records of the mcap library).
+        chunk: the packed chunk of the file, None outside chunks.
+        announced: its schemas and channels (records of the mcap library).
     """
 
     record: Record
@@ -37,12 +37,12 @@ class Part:
 
 
 def parts(path: Path, problems: list[Problem], *, most: int | None = None) -> Iterator[Part]:
-    """All that can be read of a file, in its order; what cannot goes to `problems`.
+    """All readable parts of a file in order; unreadable bytes are appended to `problems`.
 
     Args:
-        most: bytes of all chunks unpacked; None: a chunk, and so many times the size of the file.
+        most: largest unpacked size of all chunks [bytes]; None: `LARGEST_UNPACKED_RATIO` times the file, and a chunk.
 
-    Raises: UsageError if it cannot be opened, FileFormatError for a decompression bomb.
+    Raises: UsageError if the file cannot be opened, FileFormatError for a decompression bomb.
     """
     try:
         with path.open("rb") as stream:
@@ -106,7 +106,7 @@ def _announced(scan: Scan) -> list[Any]:
 
 
 def parse(opcode: int, data: bytes) -> Any:
-    """A record of the mcap library (schema, channel, metadata, header, footer), None if it cannot be one."""
+    """A record of the mcap library (schema, channel, metadata, header, footer), None if the bytes are invalid."""
     from mcap import records
     from mcap.data_stream import ReadDataStream
     from mcap.exceptions import McapError
@@ -130,7 +130,7 @@ def parse(opcode: int, data: bytes) -> Any:
 
 
 def profile_of(head: bytes) -> str | None:
-    """The profile in the header record of an MCAP file's first bytes; None if there is none."""
+    """The profile from the header record in the first bytes of an MCAP file; None without one."""
     start = len(MCAP_MAGIC) + HEAD.size
     if not head.startswith(MCAP_MAGIC) or len(head) < start + 4 or head[len(MCAP_MAGIC)] != mcap_scan.HEADER:
         return None
@@ -139,7 +139,7 @@ def profile_of(head: bytes) -> str | None:
 
 
 def from_summary(path: Path) -> tuple[list[Any], dict[int, int]]:
-    """Schemas and channels that the summary of a file repeats, and the messages of each channel; empty without one."""
+    """Schemas and channels in the summary of a file, and the number of messages by channel; empty without summary."""
     tail = HEAD.size + 20 + len(MCAP_MAGIC)
     found: list[Any] = []
     counts: dict[int, int] = {}
@@ -171,7 +171,7 @@ def from_summary(path: Path) -> tuple[list[Any], dict[int, int]]:
 
 
 def _counts(data: bytes, most: int) -> dict[int, int]:
-    """Messages of each channel out of a statistics record; {} if they could not be in `most` bytes."""
+    """Number of messages by channel from a statistics record; {} if they do not fit into `most` bytes."""
     pairs = data[46:]
     counts = {
         int.from_bytes(pairs[i : i + 2], "little"): int.from_bytes(pairs[i + 2 : i + 10], "little")

@@ -1,7 +1,7 @@
-"""Writing a flight to MCAP while flying: calls cost microseconds, a thread of its own does the work.
+"""Record a flight to MCAP while flying: a call takes microseconds, a separate thread writes.
 
-Chunks are closed twice a second (or at 256 KiB), so a process killed in mid-flight loses at most the last second.
-Messages stand in the file in the order of the calls, with log times that never decrease: replay sees what was seen.
+Chunks are closed twice a second (or at 256 KiB), so a process killed in flight loses at most the last second. Messages
+are in the file in the order of the calls, with log times that never decrease, so a replay equals the live flight.
 """
 
 import math
@@ -28,14 +28,14 @@ from crazyem.recordings.mcap.output import Output
 from crazyem.signals.sample import Block, Packet, Sample
 from crazyem.signals.vocabulary import BlockDecoder, decoders
 
-if TYPE_CHECKING:  # the recorder takes results and does not compute them
+if TYPE_CHECKING:  # for type checks only: the recorder does not compute estimates
     from crazyem.estimation.result import Estimate
 
 FLUSH_PERIOD = 0.5  # s
 
 
 class Setpoint(Protocol):
-    """What `RecordingWriter.setpoint` needs of a reference: m, m/s, m/s^2 (world), rad, rad/s."""
+    """Interface of a reference for `RecordingWriter.setpoint`: m, m/s, m/s^2 (world), rad, rad/s."""
 
     @property
     def position(self) -> Sequence[float]: ...
@@ -55,19 +55,18 @@ class RecordingWriter:
     Args:
         path: the file; its folder must exist.
         metadata: section -> key -> text, written first: run configuration, vehicle TOML, parameter table.
-        append: continue a recording that exists (finished or cut off) as its next session instead of replacing it:
-            channels are announced anew, sequence numbers and log times go on, sections of metadata are named
-            "session 2: configuration". Nothing in the file changes before the new session's first bytes are written,
-            and what these replace is only the summary at its end, which is written again.
+        append: continue an existing recording (finished or cut off) as a new session instead of replacing it. Channels
+            are announced again, sequence numbers and log times continue, sections of metadata are named
+            "session 2: configuration". The file changes with the first write of the new session, which replaces only
+            the summary at the end; `close` writes a new summary.
         output: takes the messages instead of a file: an object with the methods of `Output` and `close`.
 
     Attributes:
         path: the file, as text.
-        failure: why writing stopped (disk full, ...), "" while all is well. Flying goes on regardless.
+        failure: why writing stopped (disk full, ...), "" without failure. The flight continues after a failure.
         session: number of this session in the file, from 1.
 
-    Raises: UsageError if the file cannot be created; with `append`, FileFormatError if it is no recording that can be
-        continued.
+    Raises: UsageError if the file cannot be created; with `append`, FileFormatError if it cannot be continued.
     """
 
     def __init__(
@@ -146,45 +145,45 @@ class RecordingWriter:
         self._put(self._write_blocks, tuple(blocks))
 
     def packet(self, packet: Packet) -> None:
-        """A log packet as it came."""
+        """Record a log packet, unchanged."""
         self._put(self._write_packet, packet)
 
     def frame(self, host_time: float, data: bytes) -> None:
-        """A MAVLink frame as it came, `host_time` in s since the epoch: what a tlog would hold."""
+        """Record a MAVLink frame, unchanged, as a tlog does; `host_time` in s since the epoch."""
         self._put(self._write_frame, host_time, data)
 
     def setpoint(self, time: float, reference: Setpoint) -> None:
-        """A setpoint sent, `time` in s on the firmware clock."""
+        """Record a setpoint; `time` in s on the firmware clock."""
         self._put(self._write_setpoint, time, _now(), reference)
 
     def parameter_write(self, write: ParameterWrite) -> None:
-        """A parameter write and what became of it."""
+        """Record a write of a parameter and its result."""
         self._put(self._write_parameter, write)
 
     def estimate(self, estimate: "Estimate") -> None:
-        """An update of the estimator."""
+        """Record an update of the estimator."""
         self._put(self._write_estimate, _now(), estimate)
 
     def link(self, statistics: LinkStatistics, latency: float = math.nan) -> None:
-        """Packets so far, by fate; call it once a second. `latency` in s, where known."""
+        """Record the packets so far (received, lost, late), once a second; `latency` in s, if known."""
         self._put(self._write_link, _now(), statistics, latency)
 
     def residual(self, time: float, values: Sequence[float], sd: Sequence[float]) -> None:
-        """What the newest sample had that the model did not predict.
+        """Record the residual of the newest sample: measured minus predicted.
 
         Args:
             time: s on the firmware clock.
             values: (12,) position [m], velocity [m/s], attitude [rad], body rate [rad/s]; NaN where not measured.
-            sd: (12,) standard deviations expected of them.
+            sd: (12,) their expected standard deviations.
         """
         self._put(self._write_residual, time, _now(), tuple(map(float, values)), tuple(map(float, sd)))
 
     def event(self, text: str, level: str = "INFO") -> None:
-        """A remark: a phase of the flight, a warning. `level` is one of foxglove.Log's."""
+        """Record a message such as a phase of the flight or a warning; `level` as in foxglove.Log."""
         self._put(self._write_event, _now(), text, level)
 
     def close(self) -> None:
-        """Write everything out and finish the file; safe to call twice."""
+        """Write all data and finish the file; may be called twice."""
         with self._lock:
             if self._closed:
                 return
@@ -227,7 +226,7 @@ class RecordingWriter:
                 self.failure = self.failure or f"{self.path}: recording stopped: {error}."
 
     def _flush(self) -> None:
-        self._output.flush(sync=True)  # a power loss takes what the system still holds
+        self._output.flush(sync=True)  # data that are not on the disk are lost at a power loss
 
     def _message(self, channel: int, host_time: float, data: bytes) -> None:
         if math.isfinite(host_time):
@@ -255,7 +254,7 @@ class RecordingWriter:
             self._codecs[block.identifier] = (channel, codec)
             self._blocks[block.identifier] = block
         shown = decoders(self._blocks.values())
-        # only what a viewer's pose needs is decoded here
+        # decode only signals for the pose in viewers
         self._decoders = {
             i: BlockDecoder(d.block, wanted)
             for i, d in shown.items()
