@@ -1,10 +1,9 @@
-"""CSV files of cfclient: one a log block, merged by their stamps; a folder of them is one session, and one recording.
+"""CSV files of cfclient: one file per log block, merged by their stamps; a folder is one session and one recording.
 
-cfclient (src/cfclient/utils/logdatawriter.py) makes a folder for each connection, <config>/logdata/YYYYmmddTHH-MM-SS,
-and in it a file <block>-YYYYmmddTHH-MM-SS.csv each time that writing of a block is switched on. The first line is
-"Timestamp" and the variables; each further line the firmware's stamp, the low 24 bits of its ms, and the values as
-Python prints them, which gives every float back exactly. Rows are in order of arrival; host times and types are not in
-the file.
+cfclient (src/cfclient/utils/logdatawriter.py) makes a folder for each connection, <config>/logdata/YYYYmmddTHH-MM-SS.
+It adds a file <block>-YYYYmmddTHH-MM-SS.csv each time the user switches on the writing of a block. The first line is
+"Timestamp" and the variables. Each further line has the firmware stamp (the low 24 bits of its ms) and the values as
+Python prints them, so every float is exact. Rows are in order of arrival; the file has no host times and no types.
 """
 
 import contextlib
@@ -31,10 +30,10 @@ from crazyem.recordings.topics import ranks
 _VARIABLE = re.compile(r"[A-Za-z_]\w*\.[\w\[\]]+")
 _FILE_NAME = re.compile(r"(.+)-(\d{8}T\d\d-\d\d-\d\d)\.csv(\.gz)?")
 _DATE_FORMAT = "%Y%m%dT%H-%M-%S"
-_ONE_SESSION = 120.0  # s between estimates of when the drone was switched on: one session, blocks started late
+_ONE_SESSION = 120.0  # s; largest spread of the estimated times of switch-on in one session
 _MOST_FILES = 256  # in a folder
-_MOST_SIBLINGS = 32  # looked at where one file is read alone
-_RECORDING_SUFFIXES = {"", ".mcap", ".ulg", ".tlog", ".db3", ".parquet"}  # of what would be a recording of its own
+_MOST_SIBLINGS = 32  # files beside a single file that are checked
+_RECORDING_SUFFIXES = {"", ".mcap", ".ulg", ".tlog", ".db3", ".parquet"}  # suffixes of other recordings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,8 +42,8 @@ class _Part:
 
     Attributes:
         path: of the file.
-        block: name of the log block; the file's name where it is not as cfclient names files.
-        date: when writing was switched on, host's local time; None where the name does not say.
+        block: name of the log block; the file name if it does not follow the pattern of cfclient.
+        date: start of writing, local time of the host; None if not in the file name.
         variables: names of the columns.
         stamp: (n,) ms, unwrapped from the first.
         values: (n, k).
@@ -59,16 +58,16 @@ class _Part:
 
 
 def recognises(head: bytes) -> bool:
-    """True if the first line is "Timestamp" and names like "group.variable", or that word alone."""
+    """True if the first line is "Timestamp" with names like "group.variable", or "Timestamp" alone."""
     line = _first_line(head)
     return bool(_variables(line)) or _is_time(line)
 
 
 def recognises_folder(path: Path) -> bool:
-    """True if every CSV file in a folder is of cfclient, and all are of one session.
+    """True if every CSV file in a folder is from cfclient, and all are from one session.
 
-    Of one session: by file names and first stamps the drone was switched on at one time; where names do not say, no two
-    files have the same variables. A folder that holds recordings of other kinds too is a folder of recordings.
+    One session means: dates in file names and first stamps give the same time of switch-on; files without a date all
+    have different variables. A folder that also holds recordings of other kinds is a folder of recordings.
     """
     files = _files(path)
     others = [f for f in path.iterdir() if f.is_file() and not f.name.startswith(".") and f not in files]
@@ -91,12 +90,12 @@ def recognises_folder(path: Path) -> bool:
 def read(path: Path, options: ReadOptions) -> Recording:
     """Read a folder of log blocks, or one block alone. Time is the stamp in seconds, unwrapped (`origin` is 0).
 
-    Rows whose stamps are not 24 bits of ms are left out, and a finding says so.
+    Rows whose stamps are not 24-bit ms are left out, with a finding.
 
-    Raises: FileFormatError naming the file and line; UsageError if it cannot be read.
+    Raises: FileFormatError naming the file and line; UsageError if a file cannot be read.
     """
     if options.mapping is not None and path.is_file() and not _first_line(_head(path)).startswith(b"Timestamp"):
-        return read_csv(path, options)  # not cfclient's own: the user knows better what it is
+        return read_csv(path, options)  # not written by cfclient: the mapping of the user applies
     findings: list[Finding] = []
     faults: list[Fault] = []
     folder = path.is_dir()
@@ -127,7 +126,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _head(file: Path) -> bytes:
-    from crazyem.recordings.registry import head_of  # not above: the registry is what imports readers
+    from crazyem.recordings.registry import head_of  # not at the top: the registry imports this reader
 
     try:
         return head_of(file)
@@ -152,13 +151,13 @@ def _first_line(data: bytes) -> bytes:
 
 
 def _variables(line: bytes) -> tuple[str, ...]:
-    """Names in a header line; () if it is none."""
+    """Names of the variables in a header line; () for other lines."""
     first, *names = line.decode("latin-1").split(",")
     return tuple(names) if _is_time(first.encode()) and all(_VARIABLE.fullmatch(name) for name in names) else ()
 
 
 def _is_time(name: bytes) -> bool:
-    """Whether a column is that of the stamps: "Timestamp" of cfclient, "timestamp" of scripts after its example."""
+    """Whether a column has the stamps: "Timestamp" of cfclient, or "timestamp" of other scripts."""
     return name.strip().lower() == b"timestamp"
 
 
@@ -169,7 +168,7 @@ def _first_stamp(head: bytes) -> int | None:
 
 
 def _spread(starts: list[float]) -> float:
-    """Largest difference between times [s], those a wrap of the stamps apart being equal."""
+    """Largest difference between times [s], modulo the wrap of the stamps."""
     wrap = STAMP_MODULUS / 1000.0
     offsets = [(s - starts[0] + 0.5 * wrap) % wrap for s in starts]
     return max(offsets) - min(offsets) if offsets else 0.0
@@ -220,7 +219,7 @@ def _read_file(path: Path, findings: list[Finding], faults: list[Fault]) -> _Par
 def _segments(
     path: Path, header: bytes, body: bytes, line: int, findings: list[Finding]
 ) -> Iterator[tuple[int, bytes]]:
-    """(lines before it, text) of each stretch of rows between headers: files of one block may have been joined."""
+    """(number of lines before, text) of the rows after each header: a file may be joined from several."""
     if b"timestamp" not in body.lower():
         yield 0, body
         return
@@ -264,7 +263,7 @@ def _numbers(path: Path, text: bytes, width: int, line: int) -> NDArray[np.float
 
 
 def _plain_numbers(path: Path, text: bytes, width: int, line: int) -> NDArray[np.float64]:
-    """The same a row at a time, which finds the line that is wrong, if one is."""
+    """As `_numbers`, row by row, so that an error names its line."""
     rows = []
     for number, row in enumerate(text.split(b"\n"), start=line):
         if not row.strip():
@@ -283,14 +282,14 @@ def _plain_numbers(path: Path, text: bytes, width: int, line: int) -> NDArray[np
 
 
 def _unwrapped(stamp: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Continuous ms: each stamp within half a wrap (8388 s) of the one before."""
+    """Continuous ms: each stamp is within half a wrap (8388 s) of the previous one."""
     half = STAMP_MODULUS // 2
     steps = (np.diff(stamp) + half) % STAMP_MODULUS - half
     return np.concatenate([stamp[:1], stamp[:1] + np.cumsum(steps)])
 
 
 def _aligned(parts: Sequence[_Part]) -> list[_Part]:
-    """Parts whose stamps continue each other: the clock may have wrapped before a later file began."""
+    """Parts with stamps on one axis: the 24-bit clock may wrap between the starts of two files."""
     parts = sorted(parts, key=lambda p: (p.date or datetime.min, p.path.name))
     first = parts[0]
     result = []
@@ -304,7 +303,7 @@ def _aligned(parts: Sequence[_Part]) -> list[_Part]:
 
 
 def _tables(parts: Sequence[_Part]) -> list[Table]:
-    """A table a block, in the order of `parts`; a block written in several files is one, its gaps left as they are."""
+    """One table per block, in the order of `parts`; several files of a block are joined, gaps remain."""
     blocks: dict[tuple[str, tuple[str, ...]], list[_Part]] = {}
     for part in parts:
         blocks.setdefault((part.block, part.variables), []).append(part)

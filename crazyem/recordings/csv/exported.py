@@ -1,4 +1,4 @@
-"""CSV files that `crazyem export` wrote, read back to the recording they were made from."""
+"""Read CSV files of `crazyem export` back to the exported recording."""
 
 import csv
 import json
@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 
 
 def recognises(head: bytes) -> bool:
-    """True if the header starts as ours do."""
+    """True if the header starts like that of an exported CSV."""
     return head.removeprefix(b"\xef\xbb\xbf").startswith(f"{TIME},{HOST_TIME}".encode())
 
 
@@ -44,7 +44,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
 
 def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Iterator[Recording]:
-    """Consecutive stretches of at least `seconds` of an exported recording; events come with the first."""
+    """Consecutive parts of at least `seconds` of an exported recording; the first has the events."""
     table = _Table(path)
     held = _Held(table.description.entries)
     for batch, first in table.batches():
@@ -57,9 +57,9 @@ def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Itera
 
 
 class _Held:
-    """Rows of the table that become one recording: stamps of all rows, and of each signal the rows that have it.
+    """Rows of the table for one recording: stamps of all rows, and for each signal the rows with a sample.
 
-    Filled a batch at a time, straight from the text into the arrays of the signals: a flight is held once.
+    Batches of the text are copied directly to the arrays of the signals, so a flight is in memory once.
     """
 
     def __init__(self, entries: tuple[SignalEntry, ...], first: int = 0) -> None:
@@ -100,7 +100,7 @@ class _Held:
         shared: list[tuple[NDArray[np.int64], int, Floats, Floats]] = []
         for place, entry in enumerate(self.entries):
             order = self.order[place].rows
-            # the same rows: orders that differ by the places of the signals alone
+            # same rows: the orders differ only by the places of the signals
             known = next((k for k in shared if k[0].size == order.size and (order - k[0] == place - k[1]).all()), None)
             if known is None:
                 known = (order, place, self._of(self.time, order), self._of(self.host_time, order))
@@ -121,7 +121,7 @@ class _Held:
         return signals
 
     def _of(self, stamps: GrowingArray, order: NDArray[np.int64]) -> Floats:
-        """Stamps of the rows that a signal has."""
+        """Stamps of the rows in which a signal has samples."""
         if order.size == stamps.size:
             return stamps.rows
         return stamps.rows[order // len(self.entries) - self.first]
@@ -135,7 +135,7 @@ def _rows_with(parts: list[Any], count: int) -> NDArray[np.int64]:
 
 
 class _Table:
-    """The file, a block of rows at a time, with what is known of its columns."""
+    """The file, read in blocks of rows, with the description of its columns."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -190,7 +190,7 @@ class _Table:
         converting = pa_csv.ConvertOptions(column_types=dict.fromkeys(names, pa.float64()), null_values=[""])
         damage = Damage()
         first, header = 2, True
-        # a block at a time, not as one stream: the threads that read ahead would keep what they had of each block
+        # in blocks, not as one stream, whose read-ahead threads would keep each block in memory
         for block in text_blocks(self.path, damage):
             rows = block.partition(b"\n")[2] if header else block
             header = False
@@ -207,7 +207,7 @@ class _Table:
         self.findings += damage_notes(damage)
 
     def recording(self, held: _Held) -> Recording:
-        """The recording that some consecutive rows make."""
+        """The recording from some consecutive rows."""
         if not held.time.size:
             raise FileFormatError(f"{self.path}: there is a header but not a single sample.")
         known_of = self.description
@@ -241,14 +241,14 @@ def _guessed(titles: list[str]) -> Description:
 
 
 def _scalar(name: str, unit: str) -> tuple[str, str, str]:
-    """Quantity, unit and frame of a column that is a signal of its own."""
+    """Quantity, unit and frame of a column that is a scalar signal."""
     quantity = name.split("@", maxsplit=1)[0]
     count, known, frame = SIGNALS.get(quantity, (0, "", ""))
     return (quantity, unit, frame) if count == 1 and unit == known else ("", unit, "")
 
 
 def _vocabulary_entry(names: list[str]) -> SignalEntry | None:
-    """The vector of the vocabulary whose components the first columns are: position_x, position_y, position_z."""
+    """The vocabulary vector in the first columns, as in position_x, position_y, position_z; None if there is none."""
     for quantity, (count, unit, frame) in SIGNALS.items():
         parts = components(quantity)
         base = names[0].removesuffix(f"_{parts[0]}") if parts else ""

@@ -1,4 +1,4 @@
-"""Flights in CSV files (plain or gzip), through a mapping chosen by the user or by the header."""
+"""Read flights from CSV files (plain or gzip) with a mapping that the user gives or the header determines."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +12,7 @@ from crazyem.recordings.recording import Recording
 
 
 def recognises(head: bytes) -> bool:
-    """True if the first line reads like a CSV header: text, at least two names with delimiters between them."""
+    """True if the first line looks like a CSV header: text with at least two names and delimiters."""
     try:
         names, _ = parse_header_line(head.split(b"\n", 1)[0].decode("utf-8-sig"))
     except UnicodeDecodeError:
@@ -36,10 +36,10 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
 
 def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Iterator[Recording]:
-    """Read a CSV flight in parts of about `seconds` each, in bounded memory; joined they are what `read` gives.
+    """Read a CSV flight in parts of about `seconds` each, in bounded memory.
 
-    Arrays of a signal joined part after part, `order` included, equal those of `read`; findings are those of each part.
-    Files in long form come in one part. Raises FileFormatError, possibly after some parts.
+    The joined arrays of a signal, with `order`, equal those of `read`; each part has its own findings. Files in long
+    form come in one part. Raises FileFormatError, possibly after some parts.
     """
     header = read_header(path)
     mapping = mapping_for(header.names, options.mapping, path)

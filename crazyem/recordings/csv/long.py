@@ -1,4 +1,4 @@
-"""CSV in long form, a row a variable: log packets of a Crazyflie as a recorder wrote them down, raw values by name."""
+"""CSV in long form, one row per variable: raw values of log packets of a Crazyflie."""
 
 import math
 from collections import Counter
@@ -25,7 +25,7 @@ _LARGEST_STAMP = 2.0**53  # ms
 
 @dataclass(slots=True)
 class _Packets:
-    """Packets of one block with one list of variables, as they came."""
+    """Packets of one block with the same variables, in order of arrival."""
 
     time: list[float] = field(default_factory=list)
     order: list[int] = field(default_factory=list)
@@ -35,7 +35,7 @@ class _Packets:
 
 @dataclass(slots=True)
 class _Packet:
-    """Consecutive rows that share block, stamp and arrival."""
+    """Consecutive rows with the same block, stamp and time of arrival."""
 
     line: int
     key: tuple[str, str, str]
@@ -80,7 +80,7 @@ def read_long(path: Path, header: Header, mapping: CsvMapping, options: ReadOpti
 def _collected(
     path: Path, header: Header, mapping: CsvMapping, damage: Damage
 ) -> dict[tuple[str, tuple[str, ...]], _Packets]:
-    """All packets by (block, variables). What the host said itself is put at the newest firmware stamp seen."""
+    """All packets by (block, variables). Values of the host get the newest firmware stamp before them."""
     host_variables = {name for signal in mapping.signals.values() for name in signal.columns}
     found: dict[tuple[str, tuple[str, ...]], _Packets] = {}
     unwrapper = StampUnwrapper()
@@ -106,7 +106,7 @@ def _collected(
         elif math.isfinite(now):
             time = now
         else:
-            continue  # nothing from the firmware yet, so no time to put it at
+            continue  # no firmware stamp yet, so no time
         packets = found.setdefault((block, tuple(packet.names)), _Packets())
         packets.time.append(time)
         packets.order.append(order)
@@ -161,7 +161,7 @@ def _table(block: str, names: tuple[str, ...], packets: _Packets) -> Table:
 
 
 def _with_host_signal(signals: dict[str, SignalArray], name: str, source: SignalColumns) -> dict[str, SignalArray]:
-    """The signals, with one that the host logged variable by variable put together (it replaces what it is made of)."""
+    """The signals with a host signal joined from its variables, whose own signals it replaces."""
     variables = source.columns
     parts = [next((k for k, a in signals.items() if a.source == (v,) and not a.quantity), None) for v in variables]
     arrays = [signals[key] for key in parts if key is not None]

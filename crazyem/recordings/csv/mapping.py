@@ -1,4 +1,4 @@
-"""CSV mappings: which columns of a foreign file are which signals, in which units; one TOML file a format."""
+"""CSV mappings: the columns and units of the signals in files of other programs; one TOML file per format."""
 
 import functools
 import math
@@ -37,21 +37,21 @@ class SignalColumns:
 
     Attributes:
         quantity: key of `SIGNALS`; the name of the signal up to its "@".
-        columns: in the order of the signal's components. Three for an attitude given as roll, pitch, yaw.
-        scale: factor to SI, sign included, one a column.
-        offset: SI, added after the factor, one a column; () for none.
-        packet: name of the onboard packet the columns came in, if the file's publisher interpolated it; else None.
-        stream: signals of one stream were sampled together.
-        clock: name of the clock of the stamps; None: the clock of the file's rows.
-        frame: frame in which a vector is given, if not the signal's own: "body" or "world"; else "".
-        axes: of the given frames: ("FRD", "NED") and the like; ours are FLU and ENU.
-        inverted: the rotation given takes the world to the body.
-        attitude: the signal whose attitude turns a vector of the other frame.
+        columns: in the order of the components of the signal. Three for an attitude as roll, pitch, yaw.
+        scale: factor to SI with sign, one per column.
+        offset: SI, added after the factor, one per column; () for none.
+        packet: name of the onboard packet of the columns, if the publisher interpolated lost packets; else None.
+        stream: signals with the same stream were sampled together.
+        clock: name of the clock of the stamps; None: the clock of the rows.
+        frame: frame of a vector in the file, if not that of the signal: "body" or "world"; else "".
+        axes: of the frames in the file, such as ("FRD", "NED"); signals have FLU and ENU.
+        inverted: the rotation in the file is from world to body.
+        attitude: the attitude signal that rotates a vector from the other frame.
         missing: values that mean "not measured".
-        empty_is_missing: fields without a number mean the same, by the publisher's own account.
-        above: the signal is 1 where any column exceeds this, else 0 (for `flying`); None for plain columns.
-        hold: s for which such a 1 is kept.
-        corners: a slower stream that was drawn onto the rows by straight lines: its own samples are the corners.
+        empty_is_missing: empty fields also mean "not measured", according to the publisher.
+        above: the signal is 1 if any column exceeds this threshold, else 0 (for `flying`); None for plain columns.
+        hold: s for which the signal stays 1 afterwards.
+        corners: a slower stream was linearly interpolated at the rows; its samples are the corners.
     """
 
     quantity: str
@@ -72,7 +72,7 @@ class SignalColumns:
     corners: bool = False
 
     def converted(self, value: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, c) SI from numbers as in the file, which may be changed in place."""
+        """(n, c) SI from numbers of the file; changes `value` in place."""
         value *= self.scale
         if self.offset:
             value += self.offset
@@ -81,21 +81,21 @@ class SignalColumns:
 
 @dataclass(frozen=True, slots=True)
 class CsvMapping:
-    """A CSV format: how to recognise it by its header, and what is in it (docs/reference/formats/csv.md).
+    """A CSV format: its header and its contents (docs/reference/formats/csv.md).
 
     Attributes:
         name, title: for people.
-        layout: "wide" (a row an instant) or "long" (a row a variable).
-        recognise: columns by which the format is told.
-        time: name of the time column, and what its stamps are divided by to have seconds; "" with `rate`.
-        rate: Hz at which rows without stamps were taken, else NaN.
+        layout: "wide" (one row per instant) or "long" (one row per variable).
+        recognise: columns that identify the format.
+        time: name of the time column ("" with `rate`), and the divisor from its stamps to seconds.
+        rate: Hz, rate of rows without stamps, else NaN.
         clock: name of the clock of the rows; "host" means seconds since the epoch.
-        signals: signal name -> its columns, as they really are.
-        published: the same, as the publisher says; differs from `signals` where the publisher is wrong.
-        columns: of the long form: what each of its columns is.
+        signals: signal name -> its columns, with known errors corrected.
+        published: the same as the publisher states; differs from `signals` where the publisher is wrong.
+        columns: of the long form: role -> column name.
         units: of columns that are no signal.
-        packets: packet -> columns that are no signal but came in it.
-        claims: what the publisher says of the whole recording, e.g. mass_kg.
+        packets: packet -> its columns that are no signal.
+        claims: statements of the publisher about the whole recording, e.g. mass_kg.
     """
 
     name: str
@@ -161,7 +161,7 @@ def load_mapping(text: str, where: str) -> CsvMapping:
 
 @functools.cache
 def known_mappings() -> tuple[CsvMapping, ...]:
-    """The mappings that ship with crazyem, the most demanding first."""
+    """The mappings that ship with crazyem, those with most required columns first."""
     folder = resources.files("crazyem.recordings.csv") / "mappings"
     files = sorted((f for f in folder.iterdir() if f.name.endswith(".toml")), key=lambda f: f.name)
     loaded = (load_mapping(f.read_text(encoding="utf-8"), f.name) for f in files)
@@ -172,8 +172,8 @@ def mapping_for(header: tuple[str, ...], given: str | None, path: Path) -> CsvMa
     """The mapping of a file with this header.
 
     Args:
-        given: name of a shipped mapping (or what comes before its "_": "nanodrone"), or path of a TOML file; None: by
-            the header.
+        given: name of a shipped mapping (or its part before "_": "nanodrone"), or path of a TOML file; None: by the
+            header.
         path: of the file, for messages.
 
     Raises: UsageError if there is no such mapping file, FileFormatError if it is broken or the header is not known.
@@ -255,7 +255,7 @@ def _signal(name: str, entry: Mapping[str, Any], where: str, key: str) -> Signal
 
 
 def _unreadable(quantity: str, unit: object) -> list[float]:
-    """What a speed controller's report that cannot be read is, where the mapping does not say: the largest 16 bits."""
+    """Default of `missing`: 65535, the largest 16-bit number, for rotor speeds from speed controllers."""
     units = unit if isinstance(unit, list) else [unit]
     counted = quantity == "rotor_speed" and all(isinstance(u, str) and counts_turns(u) for u in units)
     return [65535.0] if counted else []
@@ -264,7 +264,7 @@ def _unreadable(quantity: str, unit: object) -> list[float]:
 def _ordered(
     quantity: str, columns: tuple[str, ...], entry: Mapping[str, Any], where: str, key: str
 ) -> tuple[tuple[str, ...], tuple[int, ...]]:
-    """Columns in the order of the signal's components, and which of the columns given each is."""
+    """Columns in the order of the components of the signal, and the place of each in the given columns."""
     count = SIGNALS[quantity][0]
     labels = components(quantity)
     if quantity == "attitude" and len(columns) == 3:
@@ -289,7 +289,7 @@ def _ordered(
 def _factors(
     quantity: str, count: int, entry: Mapping[str, Any], above: float | None, where: str
 ) -> tuple[tuple[float, ...], tuple[tuple[float, ...], tuple[float, ...]]]:
-    """Factor to SI of each column, in the order of the file's columns, and offsets: of the unit, and as given."""
+    """Factors to SI in the order of the columns in the file, and two offsets: of the unit, and of the mapping."""
     units = entry.get("unit", "")
     units = units if isinstance(units, list) else [units] * count
     scales = entry.get("scale", 1.0)
@@ -321,14 +321,14 @@ def _factors(
 
 
 def _component_order(quantity: str, entry: Mapping[str, Any], count: int) -> list[int]:
-    """Which component each of the file's columns is (only a wrench has components of different kinds)."""
+    """Component of each column in the file (only a wrench has components of different kinds)."""
     if quantity != "wrench_command" or "order" not in entry:
         return list(range(count))
     return [components(quantity).index(label) for label in entry["order"].replace(",", " ").split()]
 
 
 def _frame(quantity: str, entry: Mapping[str, Any], where: str) -> tuple[str, tuple[str, str]]:
-    """("body", "world" or "" for the signal's own frame, axes of body and world)."""
+    """("body", "world", or "" for the frame of the signal; axes of body and world)."""
     words = _get(entry, "frame", str, where, "").replace("to", " ").replace(",", " ").split()
     own = "body" if "body" in SIGNALS[quantity][2] else "world"
     turns = quantity == "attitude" or quantity in _ANGLE_SIGNALS

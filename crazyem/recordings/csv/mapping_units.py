@@ -1,4 +1,4 @@
-"""Units that people write in recordings: what kind of quantity each measures, and the factor to SI."""
+"""Units in recordings: the kind of quantity and the factor to SI of each."""
 
 import math
 
@@ -29,7 +29,7 @@ _UNIT_KINDS: dict[str, dict[str, float]] = {
         "deg/s": _DEGREE,
         "mdeg/s": 1e-3 * _DEGREE,
         "rpm": _TURN / 60.0,
-        "erpm": _TURN / 60.0,  # of the electrical turn: needs the number of pole pairs
+        "erpm": _TURN / 60.0,  # of the electrical field: needs the number of pole pairs
         "krpm": _TURN / 60e-3,
         "Hz": _TURN,
     },
@@ -41,7 +41,7 @@ _UNIT_KINDS: dict[str, dict[str, float]] = {
     "number": {"1": 1.0},
 }
 
-# what 0 of a unit is in SI, where not 0: pulses of servo outputs are 1000 us at no thrust, 2000 us at full thrust
+# SI value at 0 of a unit, if not 0: servo pulses have 1000 us at no thrust and 2000 us at full thrust
 _UNIT_OFFSETS: dict[tuple[str, str], float] = {("ratio", "us"): -1.0}
 
 _TIME_UNITS: dict[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1.0 / 60.0, "h": 1.0 / 3600.0}
@@ -81,7 +81,7 @@ _SPELLINGS: dict[str, str] = {
 
 
 def kind_of(quantity: str, component: int) -> str:
-    """What a component of a vocabulary signal measures: "length", "speed", "ratio", ..."""
+    """The kind of quantity of a component of a vocabulary signal: "length", "speed", "ratio", ..."""
     if quantity == "wrench_command":
         return "force" if component == 0 else "torque"
     if quantity == "voltage":
@@ -113,12 +113,12 @@ def unit_factor(unit: str, quantity: str, component: int, where: str) -> float:
 
 
 def unit_offset(unit: str, quantity: str, component: int) -> float:
-    """What 0 of `unit` is in the SI unit of a component of a signal."""
+    """The value of 0 `unit` in the SI unit of a component of a signal."""
     return _UNIT_OFFSETS.get((kind_of(quantity, component), _spelled(unit)), 0.0)
 
 
 def time_divisor(unit: str, where: str) -> float:
-    """What to divide stamps in `unit` by to have seconds. Raises FileFormatError for an unknown unit of time."""
+    """The divisor from stamps in `unit` to seconds. Raises FileFormatError for an unknown unit of time."""
     name = _spelled(unit)
     if name not in _TIME_UNITS:
         raise FileFormatError(f'{where}: unknown unit "{unit}" of time; known are {", ".join(_TIME_UNITS)}.')
@@ -131,7 +131,7 @@ def is_electrical(unit: str) -> bool:
 
 
 def counts_turns(unit: str) -> bool:
-    """Whether a unit is that of speed controllers, turns a minute of the rotor or of the electrical field."""
+    """Whether a unit is from speed controllers: turns per minute of the rotor or of the electrical field."""
     return _spelled(unit) in ("rpm", "erpm")
 
 

@@ -1,4 +1,4 @@
-"""From the columns of a wide CSV to signals, by its mapping: units, signs, frames, missing values, lost packets."""
+"""Signals from the columns of a wide CSV by its mapping: units, signs, frames, missing values, lost packets."""
 
 import math
 from collections import Counter
@@ -25,12 +25,12 @@ _FLU_TO_FRD = (1.0, 0.0, 0.0, 0.0)  # half a turn about x
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What to make of the columns of one file.
+    """How the columns of a file become signals.
 
     Attributes:
-        signals: name -> columns; those of the vocabulary first, in its order.
-        raw: columns that are no signal: column -> (name of the signal, unit, packet or None).
-        packets: packet -> all columns that came in it.
+        signals: name -> columns; the vocabulary first, in its order.
+        raw: columns without a mapping: column -> (name of the signal, unit, packet or None).
+        packets: packet -> all its columns.
         clock: name of the clock of the rows; "host" means that stamps are host times.
     """
 
@@ -42,16 +42,16 @@ class Layout:
 
 @dataclass(slots=True)
 class Rows:
-    """Some rows of a file, with neighbours on either side that help to judge them.
+    """Some rows of a file, with neighbours before and after that are needed to find interpolated rows.
 
     Attributes:
         stamp: (n,) s on the clock of the rows.
-        origin: s; `stamp - origin` is what signals get as time.
+        origin: s; signals have the time `stamp - origin`.
         columns: name -> (n,)
         keep: rows first..last-1 of these become signals, the others are neighbours.
         number: of row `keep[0]` in the file, from 0.
         starts, ends: whether these rows hold the first and the last row of the file.
-        flown: signal -> stamp of the last row before these in which its columns exceeded its threshold.
+        flown: signal -> stamp of the last earlier row in which its columns exceeded its threshold.
     """
 
     stamp: Array
@@ -64,9 +64,9 @@ class Rows:
     flown: dict[str, float] = field(default_factory=dict)
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a file may hold any double: the doctor's business
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a file may hold any double; the doctor checks them
 def signals_of(layout: Layout, rows: Rows) -> tuple[dict[str, SignalArray], list[Finding]]:
-    """The signals of the kept rows, and what was found of interpolated stretches in them; uses `rows` up."""
+    """The signals of the kept rows, and findings about interpolated rows; removes columns from `rows`."""
     first, last = rows.keep
     time = rows.stamp - rows.origin
     straight = {}
@@ -90,7 +90,7 @@ def signals_of(layout: Layout, rows: Rows) -> tuple[dict[str, SignalArray], list
         uses.subtract(source.columns)
         for column in source.columns:
             if not uses[column]:
-                del rows.columns[column]  # they are half of the memory in use
+                del rows.columns[column]  # frees half of the memory
     for column, (name, unit, raw_packet) in layout.raw.items():
         signals[name] = kept.raw(column, unit, raw_packet, step)
     return signals, findings
@@ -113,7 +113,7 @@ def _lost(packet: str, names: list[str], time: Array, rows: NDArray[np.bool_]) -
 
 
 class _Kept:
-    """The kept rows on their way to signals; arrays that signals share are made once."""
+    """Converts the kept rows to signals; arrays that signals share are made once."""
 
     def __init__(self, layout: Layout, rows: Rows, time: Array, straight: Mapping[str, NDArray[np.bool_]]) -> None:
         first, last = rows.keep
@@ -135,7 +135,7 @@ class _Kept:
         self, source: SignalColumns, value: Array, order: NDArray[np.int64], marked: NDArray[np.bool_],
         *, time: Array | None = None, host: Array | None = None,
     ) -> SignalArray:  # fmt: skip
-        """A signal of the vocabulary; without times of its own it was sampled with the rows."""
+        """A signal of the vocabulary; by default with the times of the rows."""
         _, unit, frame = SIGNALS[source.quantity]
         clock = self.layout.clock if source.clock is None else source.clock
         return SignalArray(
@@ -144,7 +144,7 @@ class _Kept:
         )  # fmt: skip
 
     def raw(self, column: str, unit: str, packet: str | None, step: int) -> SignalArray:
-        """A column as it stands; all of them have the last place of their row."""
+        """A column without a mapping; all these columns have the last place of their row."""
         if self._raw_order is None:
             self._raw_order = self.number * step + step - 1
         value = self.column(column)[:, None].copy()
@@ -165,7 +165,7 @@ class _Kept:
         )
 
     def slow(self, source: SignalColumns, place: int, step: int) -> SignalArray:
-        """A stream that was drawn onto the rows by straight lines: the samples it was drawn from."""
+        """The original samples of a slow stream that was linearly interpolated at the rows."""
         first, last = self.rows.keep
         found = corners(
             self.whole_time, self.rows.columns[source.columns[0]], starts=self.rows.starts, ends=self.rows.ends
@@ -180,7 +180,7 @@ class _Kept:
         return self.signal(source, value, order, missing[:, 0], time=time, host=host)
 
     def values(self, name: str, source: SignalColumns) -> tuple[Array, NDArray[np.bool_]]:
-        """(n, c) SI, our frames, NaN where missing; (n,) where that is ours."""
+        """(n, c) SI in FLU and ENU, NaN where missing; (n,) True where this reader set NaN."""
         if source.above is not None:
             return self._held(name, source), self.unmarked
         if source.quantity == "attitude":
@@ -201,7 +201,7 @@ class _Kept:
         return value, marked
 
     def attitude(self, name: str, source: SignalColumns) -> tuple[Array, NDArray[np.bool_]]:
-        """(n, 4) x y z w, body FLU to world, as it stands in the row (interpolated or not)."""
+        """(n, 4) x y z w, body FLU to world, of every row (interpolated or not)."""
         if name not in self._turned:
             value, marked = self._scaled(source)
             if len(source.columns) == 3:
@@ -232,14 +232,14 @@ class _Kept:
 
     @staticmethod
     def _framed(value: Array, source: SignalColumns) -> Array:
-        """Vectors and angles to FLU and ENU, whichever of the two they are given in."""
+        """Vectors and angles in FLU or ENU, from FRD or NED if necessary."""
         body, world = source.axes
         if source.quantity.endswith("euler"):
             if body == "FRD":
                 return value * [1.0, -1.0, -1.0] + [0.0, 0.0, 0.5 * math.pi]
             return value
         if value.shape[1] == 4 and body == "FRD":
-            return value * [-1.0, 1.0, -1.0, -1.0]  # thrust counts along the rotors' axis, up
+            return value * [-1.0, 1.0, -1.0, -1.0]  # thrust is positive upwards along the axis of the rotors
         if body == "FRD":
             return value * [1.0, -1.0, -1.0]
         if world == "NED":
@@ -252,7 +252,7 @@ class _Kept:
         table = source.converted(np.column_stack([self.column(c) for c in source.columns]))
         on = (table > source.above).any(axis=1)
         stamp = self.rows.stamp[self.slice]
-        # stamps as they are in the file decide, not times since the origin: the same in every part of a file
+        # stamps of the file, not times since the origin, so that the result is the same in every part of a file
         since = np.maximum.accumulate(np.where(on, stamp, -math.inf))
         since = np.maximum(since, self.rows.flown.get(name, -math.inf))
         if self.count:
@@ -261,7 +261,7 @@ class _Kept:
 
 
 def _rotated(quaternion: Array, vector: Array, *, inverse: bool) -> Array:
-    """(n, 3) vectors turned by (n, 4) quaternions of any length but 0 (NaN for that), x y z w, or turned back."""
+    """(n, 3) vectors rotated by (n, 4) quaternions x y z w of any norm (NaN for 0), or by their inverse."""
     turned = np.empty_like(vector)
     for start in range(0, len(vector), _CHUNK_ROWS):
         part = slice(start, start + _CHUNK_ROWS)

@@ -1,7 +1,7 @@
-"""CSV text to columns of doubles, a block at a time: plain or gzip, in bounded memory, damaged lines by line number.
+"""Parse CSV text (plain or gzip) to columns of doubles, in blocks and bounded memory; damaged lines are located.
 
-Blocks go through pyarrow, which rounds correctly and is fast. A block it objects to, or counts differently, is parsed
-again line by line here, so that every complaint has a line and a column and one bad line costs that line only.
+pyarrow parses each block, fast and with correct rounding. If pyarrow fails or finds another number of rows, this module
+parses the block again line by line. So each error has a line and a column, and a bad line loses only itself.
 """
 
 import csv
@@ -25,9 +25,9 @@ from crazyem.errors import FileFormatError, UsageError
 BLOCK_BYTES = 4 << 20
 LONGEST_LINE = 1 << 20  # bytes
 MOST_COLUMNS = 4096
-LARGEST_RATIO = 200  # of text to gzip; flights reach 20, constant columns 100
-_SMALL_TEXT = 64 << 20  # bytes of text below which no ratio is held against a file
-_SNIFFED_LINES = 100  # lines looked at to tell numbers from words
+LARGEST_RATIO = 200  # size of text over gzip; flights reach 20, constant columns 100
+_SMALL_TEXT = 64 << 20  # bytes; the ratio of smaller texts is not checked
+_SNIFFED_LINES = 100  # lines that show whether a column has numbers or words
 _DELIMITERS = (",", ";", "\t")
 _MISSING_WORDS = ("", "nan", "null", "none", "na", "n/a", "#n/a")
 _NULLS = sorted({form for n in _MISSING_WORDS for form in (n, n.upper(), n.capitalize())} | {"NaN"})
@@ -38,38 +38,38 @@ Columns = dict[int, NDArray[np.float64]]
 
 @dataclass(slots=True)
 class Damage:
-    """What was wrong with the text, counted while reading."""
+    """Errors in the text, counted while reading."""
 
-    rows: int = 0  # read
-    dropped: int = 0  # lines that are no rows
-    lines: list[int] = field(default_factory=list)  # the first few of them
-    first: str = ""  # what was wrong with the first
-    words: dict[int, int] = field(default_factory=dict)  # column -> values in it that are no numbers
+    rows: int = 0  # rows read
+    dropped: int = 0  # damaged lines
+    lines: list[int] = field(default_factory=list)  # numbers of the first damaged lines
+    first: str = ""  # error in the first damaged line
+    words: dict[int, int] = field(default_factory=dict)  # column -> number of values that are no numbers
     cut_line: bool = False  # the last line has no end
     cut_gzip: bool = False  # the file ends within a gzip stream
 
     def drop(self, line: int, what: str) -> None:
-        """Count a line that is no row."""
+        """Count a damaged line."""
         self.dropped += 1
         self.first = self.first or what
         if len(self.lines) < 5:
             self.lines.append(line)
 
     def check(self, path: Path) -> None:
-        """Raise FileFormatError if more than 1 % of the lines so far are damaged: that is another kind of file."""
+        """Raise FileFormatError if more than 1 % of the lines so far are damaged (another kind of file)."""
         if 100 * self.dropped > self.rows + self.dropped:
             raise FileFormatError(f"{path}: {self.first}.")
 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """The first line, and what the lines after it are written in.
+    """The names in the first line, and the format of the other lines.
 
     Attributes:
         names: of the columns, made unique.
         repeated: names that occurred more than once.
         delimiter, decimal: characters.
-        words: columns of words (neither numbers nor true/false), told by the first lines.
+        words: columns of words (neither numbers nor true/false), by the first lines.
         flags: columns of true and false.
         hollow: columns without a name and without a value in the first lines.
     """
@@ -128,12 +128,12 @@ def read_header(path: Path) -> Header:
 def read_columns(
     path: Path, header: Header, needed: Iterable[int], wanted: Iterable[int], damage: Damage, *, stamp: int | None
 ) -> Iterator[Columns]:
-    """Columns of the file as doubles, block after block of rows; empty fields are NaN, true and false 1 and 0.
+    """Columns of the file as doubles, in blocks of rows; empty fields are NaN, true and false are 1 and 0.
 
     Args:
-        needed: columns whose values must be numbers: a line where one is not is dropped and counted.
+        needed: columns whose values must be numbers; other lines are dropped and counted.
         wanted: further columns; a value that is no number becomes NaN and is counted.
-        damage: filled in on the way.
+        damage: filled in while reading.
         stamp: the column that must be finite in every row, or None.
 
     Raises: FileFormatError if more than 1 % of the lines so far are damaged, or the file cannot be unpacked.
@@ -147,7 +147,7 @@ def read_columns(
             line += block.count(b"\n")
             continue
         parsed = _fast(block, header, columns)
-        # rows without a stamp are a matter for the slow path, which knows their lines
+        # the slow path locates rows without a stamp
         if parsed is None or (stamp is not None and not np.isfinite(parsed[stamp]).all()):
             parsed = _careful(block, line, header, needed, columns, damage, stamp)
         line += block.count(b"\n")
@@ -159,11 +159,11 @@ def read_columns(
 
 
 def text_blocks(path: Path, damage: Damage, size: int = BLOCK_BYTES) -> Iterator[bytes]:
-    """Whole lines, about `size` bytes at a time; what follows the last line end is dropped and noted.
+    """Whole lines in blocks of about `size` bytes; text after the last line end is dropped and noted.
 
-    A gzip file is unpacked as it is read, never at once. One that ends early gives what was packed before its end.
+    A gzip file is unpacked piece by piece. A gzip file that ends early gives the text before its end.
 
-    Raises: FileFormatError if a line is too long, a gzip file is damaged or unpacks to something absurdly large;
+    Raises: FileFormatError if a line is too long, a gzip file is damaged or unpacks to more than `LARGEST_RATIO`;
         UsageError if the file cannot be read.
     """
     rest = b""
@@ -199,14 +199,14 @@ def text_blocks(path: Path, damage: Damage, size: int = BLOCK_BYTES) -> Iterator
 
 
 def _chunk(source: IO[bytes], size: int, packed: bool) -> tuple[bytes, bool]:
-    """Up to `size` bytes, and whether the gzip stream broke off there."""
+    """Up to `size` bytes, and whether the gzip stream ends early there."""
     if not packed:
         return source.read(size), False
     parts: list[bytes] = []
     held = 0
     try:
         while held < size:
-            part = source.read(min(1 << 13, size - held))  # small bites: a stream that breaks off loses one of them
+            part = source.read(min(1 << 13, size - held))  # small pieces: a stream that ends early loses the last one
             if not part:
                 break
             parts.append(part)
@@ -217,7 +217,7 @@ def _chunk(source: IO[bytes], size: int, packed: bool) -> tuple[bytes, bool]:
 
 
 def _fast(block: bytes, header: Header, columns: tuple[int, ...]) -> Columns | None:
-    """The block by pyarrow; None if it objects, or sees another number of rows than there are lines."""
+    """The block parsed by pyarrow; None if pyarrow fails or the number of rows differs from that of lines."""
     names = [str(i) for i in range(len(header.names))]
     types = {str(c): pa.string() if c in header.flags else pa.float64() for c in columns}
     try:
@@ -252,7 +252,7 @@ def _fast(block: bytes, header: Header, columns: tuple[int, ...]) -> Columns | N
 
 
 def _flags(column: pa.ChunkedArray) -> NDArray[np.float64] | None:
-    """1 and 0 for true and false, NaN for nothing; None if there are other words."""
+    """1 and 0 for true and false, NaN for empty fields; None if there are other words."""
     try:
         low = pc.utf8_lower(pc.utf8_trim_whitespace(column))
     except pa.ArrowException:
@@ -272,7 +272,7 @@ def _careful(
     damage: Damage,
     stamp: int | None,
 ) -> Columns:
-    """The block line by line: the reference that says what a row is."""
+    """The block parsed line by line; this function defines a valid row."""
     rows: list[list[float]] = []
     for number, raw in enumerate(block.split(b"\n")[:-1], start=line):
         if not raw.strip():
@@ -304,7 +304,7 @@ def _careful(
 
 
 def to_number(text: str, decimal: str = ".") -> float:
-    """A field as a double: NaN for nothing and for "NaN", 1 and 0 for true and false. Raises ValueError."""
+    """A field as a double: NaN for an empty field and "NaN", 1 and 0 for true and false. Raises ValueError."""
     text = text.strip()
     low = text.lower()
     if low in _MISSING_WORDS:
@@ -325,7 +325,7 @@ def _is_number(text: str, decimal: str) -> bool:
 
 
 def parse_fields(line: bytes, delimiter: str) -> list[str]:
-    """Fields of one line without its end; [] if its quotes make no sense."""
+    """Fields of a line without its end; [] if its quotes are invalid."""
     text = line.decode("utf-8", "replace").rstrip("\r")
     if '"' not in text:
         return text.split(delimiter)
@@ -341,7 +341,7 @@ def _shown(text: str) -> str:
 
 
 def _unique(names: list[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names with "#2" added to the second of a kind, "column 3" for one without a name; those that were repeated."""
+    """Unique names ("#2" added to a second one, "column 3" for an empty one), and the repeated names."""
     seen: set[str] = set()
     result, repeated = [], []
     for place, given in enumerate(names, start=1):

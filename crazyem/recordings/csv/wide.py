@@ -1,4 +1,4 @@
-"""Wide CSV files, a row an instant: read at once, or in parts when they are larger than memory."""
+"""Read wide CSV files, one row per instant: at once, or in parts if they are larger than memory."""
 
 import itertools
 import math
@@ -20,12 +20,12 @@ from crazyem.recordings.recording import Recording
 from crazyem.signals.sample import SIGNALS
 
 Array = NDArray[np.float64]
-_MOST_ROWS = 500_000  # in a part, whatever their stamps say
+_MOST_ROWS = 500_000  # in a part, at any stamps
 
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """Everything that is known before the first row is read."""
+    """How to read the file, known before the first row."""
 
     path: Path
     header: Header
@@ -39,7 +39,7 @@ class _Plan:
 
 
 class _Held:
-    """Rows read and not yet handed out, column by column (one copy of the data, not two)."""
+    """Rows that are read but not yet returned, one array per column (a single copy of the data)."""
 
     def __init__(self) -> None:
         self.arrays: dict[int, GrowingArray] = {}
@@ -53,7 +53,7 @@ class _Held:
         self.rows += more
 
     def joined(self) -> Columns:
-        """One array a column."""
+        """One array per column."""
         return {c: array.rows for c, array in self.arrays.items()}
 
 
@@ -72,18 +72,18 @@ def read_wide(path: Path, header: Header, mapping: CsvMapping, *, as_published: 
     first = float(stamp[0]) + 0.0  # no minus zero
     origin = first if _reversible(stamp, first) else 0.0
     rows = Rows(stamp, origin, _named(plan, columns), (0, stamp.size))
-    del columns, block  # so that columns can go as they turn into signals
+    del columns, block  # so that each column can be freed when its signal exists
     return _recording(plan, rows, damage, last=True)
 
 
 def read_wide_parts(
     path: Path, header: Header, mapping: CsvMapping, *, as_published: bool, seconds: float
 ) -> Iterator[Recording]:
-    """The file in parts of about `seconds`; joined they are what `read_wide` gives. Raises FileFormatError."""
+    """The file in parts of about `seconds`; joined they equal the result of `read_wide`. Raises FileFormatError."""
     plan = _planned(path, header, mapping, as_published)
     origin = _origin(plan)
     damage = Damage()
-    before: Columns = {}  # the last rows of the part before, as neighbours
+    before: Columns = {}  # the last rows of the previous part, as neighbours
     flown: dict[str, float] = {}
     number = 0
     for part, after, ends in _parts(plan, damage, seconds):
@@ -114,11 +114,11 @@ def read_wide_parts(
 
 
 def _parts(plan: _Plan, damage: Damage, seconds: float) -> Iterator[tuple[Columns, Columns, bool]]:
-    """(rows of a part, some rows after it, whether the file ends with them)."""
+    """(rows of a part, some rows after it, whether the part ends the file)."""
     held = _Held()
     number = 0
     blocks = read_columns(plan.path, plan.header, plan.needed, plan.wanted, damage, stamp=plan.stamp)
-    # what was kept back at the end may be several parts, since neighbours were waited for
+    # the rows held at the end may be several parts, because a part waits for its neighbours
     for block, neighbours in itertools.chain(zip(blocks, itertools.repeat(CONTEXT_ROWS)), [({}, 1)]):
         held.add(block)
         while (cut := _cut(plan, held, number, seconds, neighbours)) is not None:
@@ -135,7 +135,7 @@ def _parts(plan: _Plan, damage: Damage, seconds: float) -> Iterator[tuple[Column
 
 
 def _cut(plan: _Plan, held: _Held, number: int, seconds: float, neighbours: int) -> int | None:
-    """Rows that make the next part, None if it is not complete yet."""
+    """Number of rows of the next part, None if it is not complete yet."""
     if held.rows <= neighbours:
         return None
     stamp = _stamps(plan, held.joined(), held.rows, number)
@@ -145,11 +145,11 @@ def _cut(plan: _Plan, held: _Held, number: int, seconds: float, neighbours: int)
 
 
 def _origin(plan: _Plan) -> float:
-    """The first stamp if all stamps can be told from their distance to it, else 0: one pass over the stamps alone."""
+    """The first stamp if adding it to the times gives all stamps exactly, else 0; reads all stamps once."""
     if plan.stamp is None:
         return 0.0
     first = math.nan
-    # with the same lines dropped as in the pass over all columns, or their stamps would count
+    # with all needed columns, so that the same damaged lines are dropped as in the main pass
     for block in read_columns(plan.path, plan.header, plan.needed, (), Damage(), stamp=plan.stamp):
         stamp = _stamps(plan, block, 0, 0)
         first = float(stamp[0]) + 0.0 if math.isnan(first) else first
@@ -182,7 +182,7 @@ def _planned(path: Path, header: Header, mapping: CsvMapping, as_published: bool
         for name, s in given.items()
         if not present.issuperset(s.columns)
     ]
-    # the vocabulary's own signals first, in its order, as the live loop sees them; then further measurements
+    # first the vocabulary in its order, as in the live loop; then further measurements
     ranked = [*(n for n in SIGNALS if n in given), *(n for n in given if n not in SIGNALS)]
     signals = {n: given[n] for n in ranked if present.issuperset(given[n].columns)}
     if not signals and given:
@@ -199,7 +199,7 @@ def _planned(path: Path, header: Header, mapping: CsvMapping, as_published: bool
             )
     at = {name: place for place, name in enumerate(header.names)}
     time = mapping.time[0]
-    if time not in at:  # "Time" of one logger is "time" of the next
+    if time not in at:  # loggers write "Time" or "time"
         time = next((name for name in at if name.lower() == time.lower()), time)
     if time and time not in at:
         raise FileFormatError(f"{path}: the column {time}, which has the time, is missing.")
@@ -255,7 +255,7 @@ def _recording(plan: _Plan, rows: Rows, damage: Damage, *, last: bool) -> Record
 
 
 def _noted(plan: _Plan, damage: Damage) -> list[Finding]:
-    """What was wrong with the text of the file."""
+    """Findings about the text of the file."""
     notes = damage_notes(damage)
     for column, count in damage.words.items():
         name = plan.header.names[column]
@@ -264,7 +264,7 @@ def _noted(plan: _Plan, damage: Damage) -> list[Finding]:
 
 
 def damage_notes(damage: Damage) -> list[Finding]:
-    """What was wrong with the lines of a file."""
+    """Findings about damaged lines of a file."""
     notes = []
     if damage.dropped:
         where = ", ".join(map(str, damage.lines)) + (", ..." if damage.dropped > len(damage.lines) else "")
