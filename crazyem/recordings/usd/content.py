@@ -1,4 +1,4 @@
-"""What the records of a uSD card log become: times, tables, events, metadata, and what its checksum says."""
+"""Times, tables, events and metadata from the records of a uSD card log, and the check of its checksum."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,12 +33,12 @@ class Clock:
     def __init__(self, header: Header) -> None:
         self.kind, self.rate = STAMP_TYPES[header.version]
         self.wraps = header.version == 1
-        self._last: tuple[int, int] | None = None  # the last stamp, as it was and continued
+        self._last: tuple[int, int] | None = None  # the last stamp: raw and continued
 
     def seconds(
         self, order: Sequence[NDArray[np.intp]], stamps: Sequence[NDArray[np.unsignedinteger]]
     ) -> NDArray[np.float64]:
-        """(n,) s of the next records: rows of each kind, and their stamps."""
+        """(n,) s of the next records, from the rows and the stamps of each kind."""
         merged = np.empty(sum(rows.size for rows in order), self.kind)
         for rows, stamp in zip(order, stamps, strict=True):
             merged[rows] = stamp
@@ -46,7 +46,7 @@ class Clock:
             return merged / self.rate
         before, value = self._last or (int(merged[0]), int(merged[0]))
         with np.errstate(over="ignore"):
-            # modulo 2^32, so that a step back stays a step back
+            # signed difference modulo 2^32: a step back remains a step back
             steps = np.diff(merged, prepend=np.uint32(before)).view(np.int32)
         continued = value + np.cumsum(steps, dtype=np.int64)
         self._last = int(merged[-1]), int(continued[-1])
@@ -65,14 +65,14 @@ def table(event: EventType, values: NDArray[np.void], time: NDArray[np.float64],
 
 
 def events(header: Header, order: Sequence[NDArray[np.intp]], time: NDArray[np.float64]) -> tuple[Event, ...]:
-    """Events that carry nothing but their time."""
+    """Events without variables."""
     bare = [(i, event.name) for i, event in enumerate(header.events) if not event.variables]
     rows = sorted((int(row), name) for i, name in bare for row in order[i])
     return tuple(Event(float(time[row]), "log", {"name": name, "clock": "firmware"}) for row, name in rows)
 
 
 def metadata(header: Header, counts: Sequence[int], verdict: str) -> dict[str, str]:
-    """The section "usd": what the header says, the number of records of each kind, the verdict on the CRC."""
+    """The section "usd": data of the header, number of records of each kind, result of the CRC check."""
     section = {"version": str(header.version), "crc": verdict, "events": " ".join(e.name for e in header.events)}
     for event, count in zip(header.events, counts, strict=True):
         names = " ".join(f"{v}({t})" for v, t in zip(event.variables, event.letters, strict=True))
@@ -84,14 +84,14 @@ def metadata(header: Header, counts: Sequence[int], verdict: str) -> dict[str, s
 def integrity(
     *, size: int, stop: int, unknown: int | None, checksum: Checksum, last: float, blank: int | None = None
 ) -> tuple[str, list[Finding]]:
-    """What the checksum and the end of a file say: one word for the metadata, and findings.
+    """Result of the checksum and of the end of a file: one word for the metadata, and findings.
 
     Args:
         size: of the file [bytes].
-        stop, unknown: where its last whole record ends and what follows there, as in `Records`.
+        stop, unknown: end of the last whole record and the event id there, as in `Records`.
         checksum: of the file.
         last: time of the last record [s].
-        blank: from which byte on nothing was written.
+        blank: first byte of the unwritten end of the file.
     """
     left = size - stop - (CRC_BYTES if checksum.right else 0)
     evidence = {"offset_bytes": float(stop), "left_bytes": float(left), "last_s": last}
@@ -111,7 +111,7 @@ def integrity(
         )
         finding = Finding("integrity", Grade.DEGRADES, text, evidence=evidence, advice=_DAMAGE_ADVICE)
         return ("ok" if checksum.right else "wrong"), [finding]
-    # four bytes that do not start a record are a checksum; fewer, or the start of a record, are a cut
+    # four bytes that start no record are a checksum; other remaining bytes mean a cut file
     if left == CRC_BYTES and unknown is not None:
         text = (
             f"The CRC is wrong: the file says {checksum.stored:08x}, its bytes give {checksum.computed:08x}; "

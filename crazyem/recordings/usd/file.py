@@ -1,4 +1,4 @@
-"""Logs of the Crazyflie's uSD card deck, versions 1 and 2: a table for each event, read to the last whole record."""
+"""Read logs of the uSD card deck (Crazyflie), versions 1 and 2: one table per event, up to the last whole record."""
 
 import math
 from collections.abc import Iterator
@@ -15,27 +15,27 @@ from crazyem.recordings.usd.stretches import STRETCH_BYTES, Survey, stretches
 
 
 def recognises(head: bytes) -> bool:
-    """True if a file starting with these bytes is one: the files have no extension, only a magic byte and a header."""
+    """True if these first bytes are those of such a log, which has no extension, only a magic byte and a header."""
     return plausible(head)
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
     """Read a log: signals of stream "fixedFrequency" and of each other event, on the firmware's clock.
 
-    Time is the stamp in seconds, as the file has it (`origin` is 0). Events without variables become `Event`s, whose
-    time is on the firmware's clock too: the file has no other.
+    Time is the stamp of the file in seconds (`origin` is 0). Events without variables become `Event`s, with times on
+    the same firmware clock, the only clock of the file.
 
-    Raises: FileFormatError if the header makes no sense or not a single whole record follows it.
+    Raises: FileFormatError if the header is invalid or no whole record follows it.
     """
     return next(_recordings(path, options, seconds=math.inf, largest=math.inf))
 
 
 def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Iterator[Recording]:
-    """Consecutive stretches of at least `seconds` of a log, in bounded memory; joined they are what `read` gives.
+    """Consecutive parts of at least `seconds` of a log, in bounded memory; joined they equal the result of `read`.
 
-    The file is read twice: first for its checksum, how many records of which kind it has, and what motor.m1..4 is (of
-    very many rows a share decides, evenly spread). All parts have all signals, some perhaps empty, and the metadata of
-    the whole; what is said of the motors comes with the first part, what is said of the file's end with the last.
+    The file is read twice. The first pass gives the checksum, the number of records of each kind, and the meaning of
+    motor.m1..4 (from evenly spread rows if there are many). All parts have all signals, some perhaps empty, and the
+    metadata of the whole log. The first part has the findings about motors, the last those about the end of the file.
 
     Raises: as `read`, with the first part.
     """
@@ -43,7 +43,7 @@ def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Itera
 
 
 def _recordings(path: Path, options: ReadOptions, *, seconds: float, largest: float) -> Iterator[Recording]:
-    """A recording for each stretch of at least `seconds`, or of `largest` bytes of records."""
+    """A recording for each stretch of at least `seconds`, or of `largest` bytes of records if earlier."""
     survey = Survey(path)
     header = survey.header
     if not sum(survey.counts):

@@ -1,13 +1,12 @@
-"""The header of a uSD card log, which says how a record of each kind is laid out, and where its records start.
+"""Parse the header of a uSD card log, which defines the layout of each kind of record, and locate the records.
 
-Little-endian throughout: 0xBC, version u16, number of event types u16, then for each its id u16, its name ending in
-NUL, its number of variables u16 and as many names "group.variable(T)" ending in NUL, T a letter of `TYPE_LETTERS`.
+All numbers are little-endian: 0xBC, version u16, number of event types u16. For each event type: id u16, name ending in
+NUL, number of variables u16, and their names "group.variable(T)" ending in NUL, T a letter of `TYPE_LETTERS`.
 Records follow: id u16, time stamp (version 1: u32 ms; version 2, since 2021-03-18: u64 us), packed values. The last 4
 bytes are the CRC-32 of everything before them. Source: src/deck/drivers/src/usddeck.c of crazyflie-firmware.
 
-A record's length is known from its id only, so records must be walked from the first to the last. Logs are long runs of
-one kind with few others between them, so a run is taken in one comparison; where kinds alternate, the walk is a plain
-loop (0.3 us a record).
+Only the id of a record gives its length, so the records must be located one after the other. Most logs have long runs
+of one kind; one comparison locates a whole run. Alternating kinds need a plain loop (0.3 us per record).
 """
 
 import struct
@@ -21,7 +20,7 @@ from crazyem.errors import FileFormatError
 
 USD_MAGIC = 0xBC
 USD_VERSIONS = (1, 2)
-# letter -> (numpy type, C type as the firmware names it)
+# letter -> (numpy type, C type in the firmware)
 TYPE_LETTERS: dict[str, tuple[str, str]] = {
     "B": ("u1", "uint8_t"),
     "b": ("i1", "int8_t"),
@@ -32,9 +31,9 @@ TYPE_LETTERS: dict[str, tuple[str, str]] = {
     "f": ("<f4", "float"),
     "e": ("<f2", "FP16"),
 }
-STAMP_TYPES = {1: ("<u4", 1e3), 2: ("<u8", 1e6)}  # type of a stamp, and stamps a second
+STAMP_TYPES = {1: ("<u4", 1e3), 2: ("<u8", 1e6)}  # type of a stamp, and stamp units per second
 
-# The firmware writes at most 20 event types of at most 20 variables; a damaged count claims anything.
+# The firmware writes at most 20 event types of at most 20 variables; damaged counts may be huge.
 _MOST_EVENTS = 256
 _MOST_VARIABLES = 1024
 _LONGEST_NAME = 256  # bytes
@@ -45,9 +44,9 @@ class EventType:
     """A kind of record.
 
     Attributes:
-        identifier: what a record of it starts with; 0xFFFF is "fixedFrequency".
+        identifier: first two bytes of its records; 0xFFFF is "fixedFrequency".
         name: unique in the file.
-        variables: unique in the event; those without a "." are the event's own payload.
+        variables: unique in the event; names without a "." are the payload of the event.
         letters: type letter of each variable.
         layout: of a whole record; fields "id", "stamp", "0", "1", ...
     """
@@ -61,7 +60,7 @@ class EventType:
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What the file says of itself; `size` is where its records start [bytes]."""
+    """Contents of the header; the records start at byte `size`."""
 
     version: int
     events: tuple[EventType, ...]
@@ -71,7 +70,7 @@ class Header:
 def parse_header(data: bytes, path: object) -> Header:
     """The header of a log, from its first bytes (all of them, if the file is short).
 
-    Raises: FileFormatError naming `path` and the byte at which the header stops making sense.
+    Raises: FileFormatError naming `path` and the first invalid byte of the header.
     """
     cursor = _Cursor(data, path)
     if cursor.u8("magic byte") != USD_MAGIC:
@@ -94,7 +93,7 @@ def parse_header(data: bytes, path: object) -> Header:
 
 
 def plausible(head: bytes) -> bool:
-    """True if a file that starts with these bytes claims to be a log, and its first event has a name."""
+    """True if these first bytes have the form of a log header with a named first event."""
     if len(head) < 8 or head[0] != USD_MAGIC:
         return False
     version, count = struct.unpack_from("<HH", head, 1)
@@ -116,7 +115,7 @@ def _event(cursor: "_Cursor", version: int, taken: set[str]) -> EventType:
         variable, letter = text[:-3], text[-2:-1]
         if text[-3:-2] != "(" or text[-1:] != ")" or letter not in TYPE_LETTERS:
             raise FileFormatError(f'{cursor.path}: "{text[:40]}" (byte {start}) is not a variable with a known type.')
-        # a variable may be logged twice in one event: two samples, microseconds apart
+        # a variable may occur twice in an event, as two samples microseconds apart
         variables.append(_unique(variable, set(variables), f"#{len(variables)}"))
         letters.append(letter)
     fields = [("id", "<u2"), ("stamp", STAMP_TYPES[version][0])]
@@ -129,7 +128,7 @@ def _unique(name: str, taken: set[str], suffix: str) -> str:
 
 
 class _Cursor:
-    """Reads a header front to back; never past its end."""
+    """Reads a header from front to back, never past its end."""
 
     def __init__(self, data: bytes, path: object) -> None:
         self.data, self.path, self.at = data, path, 0
@@ -141,7 +140,7 @@ class _Cursor:
         return int.from_bytes(self._take(2, what), "little")
 
     def name(self, what: str) -> str:
-        """Up to the next NUL, which is skipped."""
+        """The text up to the next NUL; the cursor moves behind the NUL."""
         end = self.data.find(0, self.at, self.at + _LONGEST_NAME)
         if end < 0 and len(self.data) < self.at + _LONGEST_NAME:
             raise self._cut(what)
@@ -162,10 +161,10 @@ class _Cursor:
         return FileFormatError(f"{self.path} ends after {len(self.data)} bytes, in its header ({what}).")
 
 
-BLANK_BYTES = (b"\xff", b"\x00")  # erased flash; clusters that were set aside and never written
-_RUN_RECORDS = 16  # records of one kind in a row before a run is guessed
-_WINDOW_RECORDS = 1 << 16  # records compared at once, at most: bounds the memory of a comparison
-_GATHERED_BYTES = 1 << 22  # bytes copied at once where records of one kind do not lie side by side
+BLANK_BYTES = (b"\xff", b"\x00")  # erased flash; reserved clusters that were never written
+_RUN_RECORDS = 16  # consecutive records of one kind before a run is tested
+_WINDOW_RECORDS = 1 << 16  # most records in one comparison; bounds its memory
+_GATHERED_BYTES = 1 << 22  # memory [bytes] for one copy of records that are not adjacent
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,10 +172,10 @@ class Records:
     """Whole records in file order.
 
     Attributes:
-        start: (n,) byte at which each starts.
-        kind: (n,) index of its event type.
+        start: (n,) first byte of each record.
+        kind: (n,) index of the event type of each record.
         stop: byte after the last whole record.
-        unknown: the event id found at `stop`, None if the bytes simply run out there.
+        unknown: the event id found at `stop`, None if the data end there.
     """
 
     start: NDArray[np.int64]
@@ -186,7 +185,7 @@ class Records:
 
 
 def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int) -> Records:
-    """Every whole record of `data[begin:end]`, up to the first that is cut off or of an unknown kind."""
+    """Every whole record of `data[begin:end]` before the first that is cut off or of an unknown kind."""
     sizes = {event.identifier.to_bytes(2, "little"): event.layout.itemsize for event in events}
     start = array("q")
     append = start.append
@@ -206,14 +205,14 @@ def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int) -> 
         run = _run(data, at, end, size, int.from_bytes(identifier, "little"))
         start.frombytes(np.arange(at, at + run * size, size, dtype=np.int64).tobytes())
         at += run * size
-        streak = _RUN_RECORDS - 1 if run == _WINDOW_RECORDS else 0  # a full window: the run may go on
+        streak = _RUN_RECORDS - 1 if run == _WINDOW_RECORDS else 0  # full window: the run may continue
     starts = np.frombuffer(start, np.int64)
     unknown = int.from_bytes(identifier, "little") if size is None and at + 2 <= end else None
     return Records(starts, _kinds(data, events, starts), at, unknown)
 
 
 def written(records: Records, blank: int) -> Records:
-    """The records that begin before `blank`, a byte: in erased flash even the number of an event is 0xFFFF."""
+    """The records that begin before byte `blank`: erased flash also looks like records of event 0xFFFF."""
     count = int(np.searchsorted(records.start, blank))
     if count == records.start.size:
         return records
@@ -239,7 +238,7 @@ def _run(data: bytes, at: int, end: int, size: int, identifier: int) -> int:
 
 
 def gather(data: bytes, event: EventType, start: NDArray[np.int64]) -> NDArray[np.void]:
-    """(n,) records of one kind; a view of `data` where they lie side by side, else a copy."""
+    """(n,) records of one kind; a view of `data` if they are adjacent, else a copy."""
     size = event.layout.itemsize
     if start.size and int(start[-1]) - int(start[0]) == (start.size - 1) * size:
         return np.frombuffer(data, event.layout, start.size, int(start[0]))

@@ -1,4 +1,4 @@
-"""A uSD card log a stretch at a time: a first look at all of the file, then its records; memory does not grow."""
+"""Read a uSD card log in parts and bounded memory: a first pass over the whole file, then the records."""
 
 import zlib
 from collections.abc import Iterator, Sequence
@@ -17,25 +17,25 @@ from crazyem.recordings.usd.content import CRC_BYTES, Checksum, Clock, integrity
 from crazyem.recordings.usd.format import BLANK_BYTES, EventType, Header, Records, gather, locate, parse_header, written
 
 _READ_BYTES = 1 << 22  # bytes read at a time
-_LONGEST_HEADER = 1 << 27  # bytes; what the limits of usd/format.py add up to is less
-STRETCH_BYTES = 1 << 26  # of records in a stretch, however slowly its clock runs
-_SAMPLED_ROWS = 1 << 19  # rows from which is decided what motor.m1..4 is
+_LONGEST_HEADER = 1 << 27  # bytes; more than the limits of usd/format.py allow
+STRETCH_BYTES = 1 << 26  # bytes of records in a part, at any length in time
+_SAMPLED_ROWS = 1 << 19  # rows that decide the meaning of motor.m1..4
 
 Packed = list[NDArray[np.void]]  # records of each kind
 
 
 class Survey:
-    """What a look at a whole file tells, without keeping its records.
+    """Result of a pass over the whole file, without its records.
 
     Attributes:
         header: of the file.
         size: of the file, unpacked [bytes].
         checksum: of the file.
-        blank: byte from which on nothing was written: where a run of one of `BLANK_BYTES` begins that ends the file.
-        stop, unknown: where its last whole record ends and what follows there, as in `Records`.
-        counts: records of each kind.
+        blank: first byte of the unwritten end: of the run of one of `BLANK_BYTES` that ends the file.
+        stop, unknown: end of the last whole record and the event id there, as in `Records`.
+        counts: number of records of each kind.
 
-    Raises: FileFormatError if the header makes no sense or it cannot be unpacked; UsageError if it cannot be read.
+    Raises: FileFormatError if the header is invalid or the file cannot be unpacked; UsageError if it cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -47,7 +47,7 @@ class Survey:
         samples = {k: _Sample() for k, e in enumerate(self.header.events) if set(MOTOR_VARIABLES) <= set(e.variables)}
         tail = b""
         self.size, computed = 0, 0
-        blanks = dict.fromkeys(BLANK_BYTES, 0)  # where the last other byte ends
+        blanks = dict.fromkeys(BLANK_BYTES, 0)  # blank byte -> end of the last other byte
         for piece in pieces(path, _READ_BYTES):
             blanks = {b: self.size + len(r) if (r := piece.rstrip(b)) else at for b, at in blanks.items()}
             self.size += len(piece)
@@ -72,7 +72,7 @@ class Survey:
         )
 
     def tables(self) -> list[Table]:
-        """Tables as the whole file has them, with some rows of those that hold motor.m1..4 and none of the others."""
+        """The tables of the file, with sampled rows if they have motor.m1..4, else without rows."""
         result = []
         for k, (event, count) in enumerate(zip(self.header.events, self.counts, strict=True)):
             if count and event.variables:
@@ -82,7 +82,7 @@ class Survey:
 
 
 class _Sample:
-    """Every so many-th of the records that are added: all while they are few."""
+    """Every k-th of the added records; k doubles when the sample becomes too large."""
 
     def __init__(self) -> None:
         self.step, self.count, self.held = 1, 0, 0
@@ -106,9 +106,9 @@ class Stretch:
     """Consecutive records.
 
     Attributes:
-        first: number of the first one in the file.
+        first: number of the first record in the file.
         time: (n,) s.
-        order: rows of each kind among them.
+        order: rows of each kind among these records.
         packed: records of each kind.
         ends: True if no others follow.
     """
@@ -121,7 +121,7 @@ class Stretch:
 
 
 def stretches(survey: Survey, seconds: float, largest: float = STRETCH_BYTES) -> Iterator[Stretch]:
-    """The records of a file in stretches of at least `seconds`, or of `largest` bytes if they come sooner."""
+    """The records of a file in stretches of at least `seconds`, or of `largest` bytes if earlier."""
     header = survey.header
     total, first, begin, held_bytes = sum(survey.counts), 0, 0.0, 0
     clock = Clock(header)
@@ -144,7 +144,7 @@ def stretches(survey: Survey, seconds: float, largest: float = STRETCH_BYTES) ->
             if late.size or held_bytes >= largest or ends:
                 yield _joined(header, held, first, ends)
                 first, rows, held, held_bytes = first + rows, 0, [], 0
-    if held:  # the file has become shorter meanwhile
+    if held:  # the file became shorter during reading
         yield _joined(header, held, first, True)
 
 
@@ -156,7 +156,7 @@ def _cut(
     at: int,
     end: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.uint16], Packed]:
-    """Records `at` to `end` of a piece, copied: the piece need not stay."""
+    """A copy of the records `at` to `end` - 1 of a piece, so that the piece can be freed."""
     places = [np.searchsorted(rows, (at, end)) for rows in order]
     return time[at:end], kind[at:end], [p[a:b].copy() for p, (a, b) in zip(packed, places, strict=True)]
 
@@ -167,7 +167,7 @@ def _joined(
     kind = np.concatenate([k for _, k, _ in held])
     packed = []
     for number, event in enumerate(header.events):
-        # as bytes: records are not taken apart to be joined
+        # joining bytes is faster than joining fields
         parts = [p[number].view(np.uint8) for _, _, p in held if p[number].size]
         packed.append((np.concatenate(parts) if parts else np.empty(0, np.uint8)).view(event.layout))
     order = [np.flatnonzero(kind == number) for number in range(len(header.events))]
@@ -175,10 +175,10 @@ def _joined(
 
 
 def _walk(survey: Survey) -> Iterator[tuple[int, bytes, Records]]:
-    """A piece at a time: (where it begins in the file, its bytes, the whole records in it)."""
+    """For each piece of the file: (its offset, its bytes, the whole records in it)."""
     header = survey.header
     end = survey.size - (CRC_BYTES if survey.checksum.right else 0)
-    data, begin = b"", 0  # a piece of the file, and where it begins
+    data, begin = b"", 0  # a piece of the file and its offset
     skip = header.size
     for piece in pieces(survey.path, _READ_BYTES):
         data += piece
