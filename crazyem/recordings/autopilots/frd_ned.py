@@ -1,8 +1,8 @@
-"""From the frames of PX4 and MAVLink (body front-right-down, world north-east-down) to ours (body FLU, world z up).
+"""Conversion from the frames of PX4 and MAVLink (body front-right-down, world north-east-down) to FLU and z up.
 
-The world becomes north-west-up: x stays north and the yaw of a drone that faces north stays 0; only its sign turns, so
-that it counts counter-clockwise seen from above. Both frames turn by half a turn about x, D = diag(1, -1, -1): a
-vector v becomes D v and an attitude R becomes D R D, whose quaternion has the same scalar and x.
+The world becomes north-west-up: x stays north, and yaw is still 0 for a drone that faces north, but positive
+counter-clockwise seen from above. Both frames rotate by half a turn about x, D = diag(1, -1, -1): a vector v becomes
+D v and an attitude R becomes D R D, whose quaternion has the same scalar and x.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,17 +42,17 @@ def quaternions(columns: Columns) -> NDArray[np.float64]:
 
 
 def euler(columns: Columns) -> NDArray[np.float64]:
-    """(n, 3) roll, pitch, yaw [rad] of FLU to NWU from those of FRD to NED, both in order ZYX."""
+    """(n, 3) roll, pitch, yaw [rad] of FLU to NWU from roll, pitch, yaw of FRD to NED, both in order ZYX."""
     return vectors(columns)
 
 
 def scaled(factor: float, turned: Turn = stacked) -> Turn:
-    """What `turned` makes of columns, times a factor."""
+    """A function that returns the result of `turned` times a factor."""
     return lambda columns: turned(columns) * factor
 
 
 def bit(mask: int) -> Turn:
-    """1 where a number has this bit set, else 0."""
+    """A function that returns 1 where a number has this bit set, else 0."""
     return lambda columns: ((stacked(columns).astype(np.int64) & mask) != 0).astype(float)
 
 
@@ -62,18 +62,18 @@ def angles_of_quaternions(columns: Columns) -> NDArray[np.float64]:
 
 
 def euler_from_quaternions(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 3) roll, pitch, yaw [rad], ZYX, from (n, 4) x y z w of any length but 0; NaN for that."""
+    """(n, 3) roll, pitch, yaw [rad], ZYX, from (n, 4) x y z w of any norm; NaN for norm 0."""
     with np.errstate(invalid="ignore"):
         return euler_from_quaternion(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))
 
 
 def vehicle_of(kind: int) -> dict[str, str]:
-    """The section "vehicle" of the metadata: "mav_type" (a number of MAV_TYPE) and "kind" (its words, "quadrotor").
+    """The section "vehicle" of the metadata: "mav_type" (a number of MAV_TYPE) and "kind" (its text, "quadrotor").
 
     Args:
-        kind: MAV_TYPE; below 1 ("generic") nothing is known.
+        kind: MAV_TYPE; below 1 ("generic") the section is empty.
 
-    Source: mavlink.io/en/messages/common.html, as pymavlink has it.
+    Source: mavlink.io/en/messages/common.html, from pymavlink.
     """
     known = enums["MAV_TYPE"].get(kind) if kind > 0 else None
     if known is None:

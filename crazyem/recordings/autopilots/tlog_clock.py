@@ -1,7 +1,7 @@
-"""The clocks of a telemetry log on one axis, and what its link lost.
+"""The clocks of a telemetry log on one time axis, and the messages that its link lost.
 
-The axis is the autopilot's time since boot, or arrival where nothing has that. Lost messages show in the sequence
-numbers of MAVLink: a rate that changes is no loss.
+The axis is the time since boot of the autopilot, or the time of arrival if no message has a time since boot. The
+sequence numbers of MAVLink show lost messages; a change of rate is not a loss.
 """
 
 import itertools
@@ -17,19 +17,19 @@ from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.stamps import RESTART_SECONDS, STAMP_CHECK, Fault, impossible, restarts
 from crazyem.recordings.topics import seconds
 
-_EPOCH_US = 10**15  # us; a `time_usec` beyond is since 1970, below since boot
+_EPOCH_US = 10**15  # us; a larger `time_usec` is since 1970, a smaller one since boot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _MessageTimes:
-    """The times that messages of one kind carry.
+    """The times in messages of one kind.
 
     Attributes:
         time: (n,) s since boot, or since 1970.
-        utc: whether since 1970.
-        bad: (n,) True where the message has none that can be.
-        host: (n,) s since 1970 of arrival.
-        place: (n,) in the order of the log.
+        utc: whether the times are since 1970.
+        bad: (n,) True where the time is absent or impossible.
+        host: (n,) time of arrival, s since 1970.
+        place: (n,) place in the log.
     """
 
     time: NDArray[np.float64]
@@ -40,10 +40,10 @@ class _MessageTimes:
 
 
 class Clocks:
-    """The clocks of a log on one axis: time since boot of the autopilot, or the host's if no message has that.
+    """The clocks of a log on one axis: time since boot of the autopilot, or host time if no message has it.
 
-    A message without a time of its own is placed by its arrival, less the median of what others took to arrive. Where
-    the autopilot was started again in the middle of a log, the median of each start places the messages that follow.
+    A message without its own time is placed by its arrival minus the median delay of the other messages. If the
+    autopilot restarts within a log, each start has its own median for the messages that follow.
     """
 
     def __init__(self, found: Frameset, system: int) -> None:
@@ -58,11 +58,11 @@ class Clocks:
             if own is not None:
                 (epochs if own.utc else boots).setdefault(component, []).append(own)
         self._utc = {c: float(np.median(_joined([o.host - o.time for o in v], v))) for c, v in epochs.items()}
-        # component -> place of the first message of each start but the first; host time at which each start was
+        # component -> place of the first message of each restart; host time of each start
         self._starts = {c: _starts(v) for c, v in boots.items()}
         self._boots = {c: _offsets(v, self._starts[c]) for c, v in boots.items()}
         self.component = max(counts, key=lambda c: (c in self._boots, counts[c], -c))
-        self.boot: float | None = None  # host time at which the axis is 0, None: no such axis
+        self.boot: float | None = None  # host time at 0 of the axis; None: axis of arrival
         if self.component in self._boots:
             self.boot = float(self._boots[self.component][0])
         own_of = boots.get(self.component, [])
@@ -74,11 +74,11 @@ class Clocks:
 
     @property
     def starts(self) -> NDArray[np.int64]:
-        """Places (k,) in the log from which on the autopilot read is one started again."""
+        """Places (k,) in the log at which the autopilot restarts."""
         return self._starts.get(self.component, np.empty(0, np.int64))
 
     def place(self, component: int, frames: Frames, message: object, name: str) -> tuple[NDArray[np.float64], str]:
-        """Times of frames on the axis [s], and the clock they are of; takes note of stamps that cannot be."""
+        """Times of frames on the axis [s], and the name of their clock; adds impossible stamps to `faults`."""
         arrival = self.arrival(np.array(frames.stamps, np.int64))
         own = _message_times(message, frames) if self.boot is not None else None
         if own is None or self.boot is None:
@@ -95,13 +95,13 @@ class Clocks:
         return np.where(own.bad, arrival, time), clock
 
     def arrival(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Times on the axis [s] of what arrived at these times [us]."""
+        """Times on the axis [s] from times of arrival [us]."""
         if self.boot is None:
             return seconds(stamps - int(self.origin) * 1_000_000)
         return seconds(stamps) - self.boot
 
     def findings(self) -> list[Finding]:
-        """What to know of the time axis."""
+        """Findings about the time axis."""
         if self.boot is None:
             text = "No message has the autopilot's own time; all times are those of arrival at the ground station."
             return [note("mapping", text, Grade.DEGRADES)]
@@ -112,7 +112,7 @@ class Clocks:
         return [note("mapping", text, boot_s=self.boot), *self._parts(self.boot)]
 
     def _parts(self, boot: float) -> list[Finding]:
-        """That the autopilot was started again, and where the parts of the log are."""
+        """A finding about restarts of the autopilot, with the times of the parts of the log."""
         if not self._firsts:
             return []
         edges = [self._ends[0], *self._firsts, self._ends[1]]
@@ -132,9 +132,9 @@ def _joined(columns: list[NDArray[np.float64]], own: list[_MessageTimes]) -> NDA
 
 
 def _starts(own: list[_MessageTimes]) -> NDArray[np.int64]:
-    """Places (k,) of the first message of each start of an autopilot but the first.
+    """Places (k,) of the first message after each restart of an autopilot.
 
-    The message that came most often tells where the clock goes back; others may have come since the message before.
+    The most frequent message shows the step back of the clock. Other messages of the new start may arrive before it.
     """
     most = max(own, key=lambda o: int((~o.bad).sum()))
     time, place = most.time[~most.bad], most.place[~most.bad]
@@ -153,7 +153,7 @@ def _offsets(own: list[_MessageTimes], starts: NDArray[np.int64]) -> NDArray[np.
 
 
 def _message_times(message: object, frames: Frames) -> _MessageTimes | None:
-    """Times that messages carry; None if they carry none, or too few that can be."""
+    """Times in messages; None if they have none, or at most half of them are known."""
     names = message.fieldnames  # type: ignore[attr-defined]
     column = next((name for name in ("time_boot_ms", "time_usec") if name in names), None)
     if column is None:
@@ -177,18 +177,18 @@ def _message_times(message: object, frames: Frames) -> _MessageTimes | None:
     return _MessageTimes(time, utc, bad, host, np.array(frames.places, np.int64))
 
 
-# a message this many places behind is one that came late or twice; more is the next round of the numbers
+# a sequence number up to this many behind is a late or repeated message; more is the next cycle of 256 numbers
 _LATE_PLACES = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Link:
-    """What the sequence numbers of one component say.
+    """Losses of one component by its sequence numbers.
 
     Attributes:
-        received: different messages in the log.
-        lost: messages that are missing, at least: numbers have 8 bits.
-        before, after: (k,) us of arrival on either side of each loss.
+        received: number of different messages in the log.
+        lost: least number of missing messages: sequence numbers have 8 bits.
+        before, after: (k,) times of arrival before and after each loss [us].
     """
 
     received: int
@@ -197,10 +197,10 @@ class Link:
     after: NDArray[np.int64]
 
     def findings(self, time: Callable[[NDArray[np.int64]], NDArray[np.float64]]) -> Iterator[Finding]:
-        """One finding, with where messages are missing; none if nothing is.
+        """One finding with the times of missing messages; none without losses.
 
         Args:
-            time: from arrivals [us] to times on the axis of the recording [s].
+            time: function from times of arrival [us] to times on the axis of the recording [s].
         """
         if not self.lost:
             return
@@ -215,10 +215,10 @@ class Link:
 
 
 def link(found: Frameset, system: int, component: int, starts: NDArray[np.int64]) -> Link:
-    """The messages of a component; those that came twice or late are neither lost nor counted again.
+    """Losses of a component; a late message is not lost, and a repeated one counts once.
 
     Args:
-        starts: places (k,) in the log at which the numbers begin anew.
+        starts: places (k,) in the log at which the sequence numbers restart.
     """
     chosen = [f for (s, c, _), f in found.frames.items() if (s, c) == (system, component)]
     place = np.concatenate([np.array(f.places, np.int64) for f in chosen])

@@ -1,8 +1,8 @@
-"""MAVLink telemetry logs (tlog): each message at its own rate, turned from FRD and NED to FLU and NWU.
+"""Read MAVLink telemetry logs (tlog): each message at its own rate, converted from FRD and NED to FLU and NWU.
 
-A ground station writes a tlog: it knows when it received a message and, where the message says so, the autopilot's
-time since boot. The latter is the time axis (`tlog_clock`). What becomes which signal is the table of `tlog_signals`;
-docs/reference/formats/tlog.md explains it.
+A ground station writes a tlog with the time of arrival of each message; some messages also have the time since boot of
+the autopilot, which is the time axis (`tlog_clock`). The table in `tlog_signals` maps messages to signals;
+docs/reference/formats/tlog.md explains the table.
 """
 
 from collections import Counter
@@ -27,9 +27,9 @@ _ARDUPILOT = 3
 _NOT_A_VEHICLE = {6, 18, 26, 27, 28, 30}  # MAV_TYPE of ground stations, onboard computers, gimbals, cameras ...
 _INVALID_AUTOPILOT = 8
 _MOST_EVENTS = 2000
-_SOUND_FRAMES = 3  # that make a file a tlog
-_SKIPPED_HEAD = 4096  # bytes of garbage before them that are tolerated
-# messages that come several at once, and the field that tells them apart
+_SOUND_FRAMES = 3  # least number of sound frames in a tlog
+_SKIPPED_HEAD = 4096  # bytes; most invalid bytes before the first frame
+# messages with several instances, and the field with the number of the instance
 _INSTANCE = {
     "BATTERY_STATUS": "id",
     "HIGHRES_IMU": "id",
@@ -52,7 +52,7 @@ def recognises(head: bytes) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
-    """Read a telemetry log. Raises FileFormatError naming the file and what is wrong with it."""
+    """Read a telemetry log. Raises FileFormatError naming the file and the reason."""
     data = contents(path)
     found = scan(data)
     size = len(data)
@@ -92,7 +92,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
 
 def _beat(found: Frameset, system: int) -> tuple[int, int]:
-    """MAV_TYPE and MAV_AUTOPILOT of a system by its heartbeats; (-1, -1) where none says that it is a vehicle."""
+    """MAV_TYPE and MAV_AUTOPILOT of a system by its heartbeats; (-1, -1) if it is not a vehicle."""
     for (sender, _, message), frames in sorted(found.frames.items()):
         if sender == system and message == 0:
             columns = columns_of(MESSAGES[0], frames.payloads[:1])
@@ -103,7 +103,7 @@ def _beat(found: Frameset, system: int) -> tuple[int, int]:
 
 
 def _vehicle(found: Frameset) -> tuple[int, list[Finding]]:
-    """The system to read: a vehicle by its heartbeat if there is one, of several the one that sent most."""
+    """The system to read: the vehicle (by heartbeats) with most messages, else the system with most; and findings."""
     counts: Counter[int] = Counter()
     for (system, _, _), frames in found.frames.items():
         counts[system] += len(frames.stamps)
@@ -121,7 +121,7 @@ def _vehicle(found: Frameset) -> tuple[int, list[Finding]]:
 
 
 def _topics(found: Frameset, system: int, clocks: Clocks) -> list[Topic]:
-    """A topic a message, and one an instance and a component beyond the first: "BATTERY_STATUS_1", "158/ATTITUDE"."""
+    """One topic per message, instance and component; suffix and prefix as in "BATTERY_STATUS_1", "158/ATTITUDE"."""
     topics = []
     for (sender, component, identifier), frames in sorted(found.frames.items(), key=lambda kv: kv[1].places[0]):
         message = MESSAGES[identifier]
@@ -142,7 +142,7 @@ def _topics(found: Frameset, system: int, clocks: Clocks) -> list[Topic]:
 
 
 def _instances(name: str, columns: Mapping[str, NDArray[np.generic]]) -> list[tuple[str, NDArray[np.int64]]]:
-    """Suffix and rows of each instance of a message: the first, whatever its number, has no suffix."""
+    """Suffix and rows of each instance of a message; the first has no suffix, unless instances have names."""
     key = columns.get(_INSTANCE.get(name, ""))
     if key is None:
         return [("", np.arange(next(iter(columns.values())).size))]
@@ -193,7 +193,7 @@ def _parameters(found: Frameset, system: int) -> dict[str, str]:
 
 
 def _events(found: Frameset, system: int) -> tuple[Event, ...]:
-    """What the vehicle said in words."""
+    """Text messages of the vehicle."""
     events = []
     for (sender, _, identifier), frames in found.frames.items():
         if sender == system and MESSAGES[identifier].msgname == "STATUSTEXT":

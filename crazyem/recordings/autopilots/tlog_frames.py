@@ -1,8 +1,8 @@
-"""Frames of a MAVLink telemetry log: found, checked and unpacked in bulk, with pymavlink's message definitions.
+"""Find, check and unpack the frames of a MAVLink telemetry log with the message definitions of pymavlink.
 
-A tlog is a run of [time of arrival, 8 bytes, big-endian, microseconds since 1970][MAVLink 1 or 2 frame]. pymavlink
-decodes one message at a time into an object; here the frames of one message are unpacked together, by numpy, with the
-types, order and checksum seed that pymavlink knows. Source: mavlink.io/en/guide/serialization.html.
+A tlog is a sequence of [time of arrival, 8 bytes, big-endian, microseconds since 1970][MAVLink 1 or 2 frame]. pymavlink
+decodes messages one by one. For speed, numpy unpacks here all frames of a message together, with the types, order and
+checksum seed from pymavlink. Source: mavlink.io/en/guide/serialization.html.
 """
 
 import re
@@ -19,7 +19,7 @@ from crazyem.links.mavlink.frames import FRAME_MARKS, header, is_sound, layout
 MESSAGES: Mapping[int, Any] = ardupilotmega.mavlink_map
 _EARLIEST_STAMP = 946_684_800_000_000  # us: the year 2000
 _LATEST_STAMP = 4_102_444_800_000_000  # us: the year 2100
-# where a frame may begin: a time of arrival between those years, and the mark of a frame
+# possible start of a frame: a time of arrival between these years, and the mark of a frame
 _START = re.compile(rb"(?s)(?=\x00[\x03-\x0e].{6}[\xfd\xfe])")
 
 Key = tuple[int, int, int]  # system, component, message
@@ -37,13 +37,13 @@ class Frames:
 
 @dataclass(slots=True)
 class Frameset:
-    """What a log holds.
+    """The frames of a log.
 
     Attributes:
         frames: by system, component and message.
         skipped: (offset, count) of each run of bytes that is no sound frame.
-        unknown: frames of messages that pymavlink does not know; they cannot be checked nor read.
-        total: sound frames.
+        unknown: number of frames of messages that pymavlink does not know; they cannot be checked or read.
+        total: number of sound and unknown frames.
     """
 
     frames: dict[Key, Frames] = field(default_factory=dict)
@@ -68,7 +68,7 @@ def scan(data: bytes, at_most: int | None = None) -> Frameset:
 
 
 def _frame(data: bytes, at: int, found: Frameset | None) -> int:
-    """Byte after the frame at `at`, 0 if there is no sound one; takes it up into `found`."""
+    """Byte after the frame at `at`, 0 if there is no sound one; adds the frame to `found`."""
     if at + 8 + 8 > len(data):
         return 0
     stamp = int.from_bytes(data[at : at + 8], "big")
@@ -99,7 +99,7 @@ def _frame(data: bytes, at: int, found: Frameset | None) -> int:
 
 
 def _looks_like_frame(data: bytes, at: int) -> bool:
-    """True at the end of the log, or where a time of arrival and the start of a frame are."""
+    """True at the end of the log, or at a time of arrival followed by the mark of a frame."""
     if at == len(data):
         return True
     if at + 9 > len(data):
@@ -108,7 +108,7 @@ def _looks_like_frame(data: bytes, at: int) -> bool:
 
 
 def _resume(data: bytes, damaged: int) -> int:
-    """The next place after `damaged` with a sound frame; the end of the log if there is none."""
+    """Offset of the next sound frame after `damaged`; the end of the log if there is none."""
     for start in _START.finditer(data, damaged + 1):
         if _frame(data, start.start(), None):
             return start.start()
@@ -118,8 +118,8 @@ def _resume(data: bytes, damaged: int) -> int:
 def columns_of(message: Any, payloads: list[bytes]) -> dict[str, NDArray[np.generic]]:
     """Fields of all frames of one message, in the types in which they were sent: name -> (n,).
 
-    An array becomes a column an element, "voltages[0]"; text stays one column of bytes. MAVLink 2 cuts zeros off the
-    end of a payload, and MAVLink 1 knows no extension fields: what is not there is 0.
+    Each element of an array becomes a column, "voltages[0]"; a text is one column of bytes. Missing bytes are 0:
+    MAVLink 2 cuts zeros off the end of a payload, and MAVLink 1 has no extension fields.
     """
     names: list[str] = []
     kinds: list[Any] = []
@@ -140,6 +140,6 @@ def columns_of(message: Any, payloads: list[bytes]) -> dict[str, NDArray[np.gene
 
 
 def units_of(message: Any, columns: Mapping[str, object]) -> dict[str, str]:
-    """Units of the columns, as the MAVLink definitions give them."""
+    """Units of the columns from the MAVLink definitions."""
     units = {name: unit.replace("/s/s", "/s^2") for name, unit in message.fieldunits_by_name.items()}
     return {c: units[c.partition("[")[0]] for c in columns if c.partition("[")[0] in units}

@@ -1,4 +1,4 @@
-"""Which fields of which MAVLink messages are which signals in a telemetry log: the best source first.
+"""Signals of a telemetry log and their fields in MAVLink messages, the best source first.
 
 docs: tlog.md explains the table. Sources: mavlink.io/en/messages/common.html, ArduPilot's GCS_MAVLINK (units of
 RAW_IMU).
@@ -31,7 +31,7 @@ ARMED = 128  # in HEARTBEAT.base_mode
 
 
 def _cells(columns: Columns) -> NDArray[np.float64]:
-    """V of a battery from its cells [mV]; 65535 is a cell that is not there, 0 one of the extension that is not."""
+    """Voltage of a battery [V] from its cells [mV]; an absent cell has 65535, in the extension field 0."""
     cells = stacked(columns)
     return np.where(cells == 65535, 0.0, cells).sum(axis=1, keepdims=True) * 1e-3
 
@@ -41,7 +41,7 @@ def _equal(column: str, value: int) -> Callable[[Topic], NDArray[np.bool_]]:
 
 
 def _masked(bits: int, *, local: bool = False) -> Callable[[Topic], NDArray[np.bool_]]:
-    """Rows whose `type_mask` says to ignore the value; with `local`, also those that are not in the local frame."""
+    """Function for the rows whose `type_mask` excludes the value; with `local`, also rows not in the local frame."""
 
     def invalid(topic: Topic) -> NDArray[np.bool_]:
         rows = (topic.columns["type_mask"].astype(np.int64) & bits) != 0
@@ -51,7 +51,7 @@ def _masked(bits: int, *, local: bool = False) -> Callable[[Topic], NDArray[np.b
 
 
 def _shared(signal: str, message: str) -> Source:
-    """What a live link reads from a message, read from a log the same way."""
+    """The source of a signal in a log with the same mapping as for a live link."""
     row = mapping(signal, message)
     kinds = {"vector": vectors, "quaternion": quaternions, "angles": lambda c: quaternion_from_euler(*euler(c).T)}
     frame = {"position": WORLD, "velocity": WORLD, "attitude": ATTITUDE}.get(signal, BODY)
@@ -108,5 +108,5 @@ TLOG_SIGNALS: tuple[Source, ...] = (
     Source("attitude", "ATT_POS_MOCAP", _Q, quaternions, frame=ATTITUDE, origin="mocap"),
     Source("position", "VISION_POSITION_ESTIMATE", _XYZ, vectors, frame=WORLD, origin="vision"),
 )
-# raw counts by the definition, milli-g and mrad/s from ArduPilot
+# MAVLink defines raw counts; ArduPilot sends milli-g and mrad/s
 RAW_IMU: tuple[Source, ...] = (_shared("body_rate", "RAW_IMU"), _shared("specific_force", "RAW_IMU"))

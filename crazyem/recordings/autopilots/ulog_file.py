@@ -1,7 +1,7 @@
-"""PX4 ULog files: each topic at its own rate, on the autopilot's clock, turned from FRD and NED to FLU and NWU.
+"""Read PX4 ULog files: each topic at its own rate, on the clock of the autopilot, from FRD and NED to FLU and NWU.
 
-Decoding is pyulog's; `ulog_scan` decides before what of a file is sound. What becomes which signal is the table
-`_ULOG_SIGNALS`; docs: ulog.md explains it. Sources: docs.px4.io (ULog file format, uORB message reference).
+pyulog decodes the messages; `ulog_scan` removes damaged ones first. The table `_ULOG_SIGNALS` maps topics to signals;
+docs: ulog.md explains the table. Sources: docs.px4.io (ULog file format, uORB message reference).
 """
 
 import contextlib
@@ -42,22 +42,22 @@ if TYPE_CHECKING:
     from pyulog import ULog
 
 AUTOPILOT_CLOCK = "autopilot"  # microseconds since boot
-_MOST_PARAMETERS = 4000  # that are kept as metadata
-_MOST_MESSAGES = 500  # texts of the autopilot that are kept
+_MOST_PARAMETERS = 4000  # parameters in the metadata, at most
+_MOST_MESSAGES = 500  # texts of the autopilot in the metadata, at most
 _SECOND = 1_000_000  # us
-# a sample may lie this long before its publication; beyond, the stamp is not believed
+# us; longest delay from a sample to its publication; with a longer one the stamp of the sample is not used
 _LONGEST_DELAY = 1 * _SECOND
 
 Data = Mapping[str, NDArray[np.generic]]
 
 
 def recognises(head: bytes) -> bool:
-    """True if a file starting with these bytes is one."""
+    """True if these first bytes are those of a ULog file."""
     return head.startswith(ULOG_MAGIC)
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
-    """Read a ULog file. Raises FileFormatError naming the file and what is wrong with it."""
+    """Read a ULog file. Raises FileFormatError naming the file and the reason."""
     data = contents(path)
     if not recognises(data) or len(data) < HEADER_BYTES:
         raise FileFormatError(
@@ -82,7 +82,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
 
 def _kind(log: "ULog") -> int:
-    """MAV_TYPE: of the status that PX4 publishes, else of its parameter; 0 where neither says."""
+    """MAV_TYPE from the status that PX4 publishes, else from its parameter; 0 without both."""
     status = next((d.data["system_type"] for d in log.data_list if "system_type" in d.data), None)
     if status is not None and status.size and int(status[-1]):
         return int(status[-1])
@@ -91,24 +91,24 @@ def _kind(log: "ULog") -> int:
 
 
 def _decode(path: Path, sound: Scan) -> "ULog":
-    """pyulog's view of the sound messages; whatever it trips over names the file. Raises MissingExtraError, too."""
+    """The sound messages, decoded by pyulog. Raises FileFormatError naming the file, MissingExtraError."""
     library = require("pyulog", "Reading a ULog file")
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints what it notices
+        with contextlib.redirect_stdout(io.StringIO()):  # pyulog prints warnings
             log: ULog = library.ULog(io.BytesIO(sound.data))
             return log
-    except Exception as error:  # of any kind, from deep inside pyulog
+    except Exception as error:  # pyulog raises many kinds
         raise FileFormatError(f"{path}: the log cannot be decoded ({type(error).__name__}: {error}).") from error
 
 
 def _topics(log: "ULog", identifiers: NDArray[np.uint16]) -> tuple[list[Topic], list[Fault]]:
-    """One topic a message and instance, its rows in the order of the file, times in s since boot.
+    """One topic per message and instance, rows in the order of the file, times in s since boot.
 
     Args:
         log: decoded.
-        identifiers: (m,) of the topic of each data message, in the order of the file.
+        identifiers: (m,) identifier of the topic of each data message, in the order of the file.
 
-    Returns: the topics without the records whose stamps cannot be, and what was wrong with those.
+    Returns: the topics without records with impossible stamps, and the faults of these stamps.
     """
     sets = [d for d in log.data_list if d.data["timestamp"].size]
     published = [seconds(d.data["timestamp"]) for d in sets]
@@ -134,16 +134,16 @@ def _name(d: "ULog.Data") -> str:
 
 
 def _places(d: "ULog.Data", identifiers: NDArray[np.uint16]) -> NDArray[np.float64]:
-    """(n,) where the records of a topic stand among all of the file; NaN where that is not known."""
+    """(n,) places of the records of a topic among all records of the file; NaN if unknown."""
     places = np.flatnonzero(identifiers == d.msg_id).astype(float)
     count = d.data["timestamp"].size
     return places if places.size == count else np.full(count, np.nan)
 
 
 def _stamps(data: Data) -> tuple[NDArray[np.uint64], str]:
-    """(n,) us at which the values were measured, and the column that says so.
+    """(n,) times of measurement [us], and their column.
 
-    That is `timestamp_sample` where a message has it and it lies shortly before the publication (`timestamp`).
+    The column is `timestamp_sample` if it exists and is shortly before the publication, else `timestamp`.
     """
     published = np.asarray(data["timestamp"]).astype(np.uint64)
     column = data.get("timestamp_sample")
@@ -155,7 +155,7 @@ def _stamps(data: Data) -> tuple[NDArray[np.uint64], str]:
 
 
 def _valid(*flags: str) -> Callable[[Topic], NDArray[np.bool_]]:
-    """Rows in which one of the flags is not set; a flag that the message does not have counts as set."""
+    """Function for the rows in which a flag is not set; a flag that the message does not have counts as set."""
 
     def invalid(topic: Topic) -> NDArray[np.bool_]:
         rows = [topic.columns[flag] == 0 for flag in flags if flag in topic.columns]
@@ -175,7 +175,7 @@ def _not(columns: Columns) -> NDArray[np.float64]:
 
 
 def _odometry(topic: str, origin: str) -> tuple[Source, Source]:
-    """An estimate from outside, where it is in NED."""
+    """Pose from an external source, in rows that are in NED."""
     place, turn = named("position[*]", _THREE), named("q[*]", _FOUR)
     return (
         Source("position", topic, place, vectors, _other_frame, absent_is_nan=True, frame=WORLD, origin=origin),
@@ -245,7 +245,7 @@ def _notes(signals: Mapping[str, object]) -> list[Finding]:
 
 
 def _metadata(log: "ULog") -> dict[str, dict[str, str]]:
-    """What the log says of the autopilot, its parameters and its own words."""
+    """Information about the autopilot, its parameters and its text messages."""
     info = {text_of(k): text_of(v) for k, v in list(log.msg_info_dict.items())[:200]}
     version = log.get_version_info_str() if isinstance(log.msg_info_dict.get("ver_sw_release"), int) else None
     info |= {"version": version} if version else {}

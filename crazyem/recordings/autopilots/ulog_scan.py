@@ -1,9 +1,9 @@
-"""Walks the messages of a ULog file: what is sound is handed to pyulog, what is not is named by its place.
+"""Check the messages of a ULog file: sound ones are passed to pyulog, damaged ones are located.
 
-pyulog trusts the sizes that a file claims (an array of 10^9 elements becomes 10^9 fields) and steps over damage a byte
-at a time. So every message is checked here first: that its type exists, that it has the size that its type demands,
-that a data message belongs to a topic and has the size of its format. After damage the walk goes on at the next place
-where four sound messages follow each other. ULog has no checksums: a flipped bit inside a value cannot be noticed.
+pyulog trusts the sizes in a file (an array of 10^9 elements becomes 10^9 fields) and skips damage byte by byte. So this
+module first checks every message: its type exists, its size fits its type, and a data message belongs to a topic and
+has the size of its format. After damage the scan continues at the next four consecutive sound messages. ULog has no
+checksums, so a flipped bit inside a value cannot be detected.
 
 Source: docs.px4.io/main/en/dev_log/ulog_file_format.
 """
@@ -30,10 +30,10 @@ TYPE_SIZES = {
     "bool": 1,
     "char": 1,
 }
-_LARGEST_MESSAGE = 65535  # bytes of a message: its size has 16 bits
+_LARGEST_MESSAGE = 65535  # bytes; the size of a message has 16 bits
 _MOST_FIELDS = 200_000  # of all topics together
 _DEEPEST_NESTING = 8  # types within types
-_SOUND_MESSAGES = 4  # messages in a row that make a place sound
+_SOUND_MESSAGES = 4  # consecutive sound messages at which the scan continues after damage
 _MESSAGE_TYPES = b"DAFIMPQLCOSRB"
 _CANDIDATE = re.compile(b"(?=[\x00-\x1f][" + _MESSAGE_TYPES + b"])")  # upper half of a size below 8 KiB, type
 _FORMAT = re.compile(rb"[A-Za-z0-9_\-/]+:(?:\w+(?:\[\d{1,10}\])? \w+;)*(?:\w+(?:\[\d{1,10}\])? \w+)?\Z")
@@ -43,14 +43,14 @@ _KEY = re.compile(rb"(\w+)(?:\[(\d{1,10})\])? [^\x00-\x1f]+\Z")
 
 @dataclass(slots=True)
 class Scan:
-    """What a file holds.
+    """Result of the scan of a file.
 
     Attributes:
-        data: header and all sound messages, or the file itself if it is sound throughout.
+        data: header and all sound messages; the file itself if all of it is sound.
         skipped: (offset, count) of each run of bytes that is no sound message.
-        refused: why a topic that the file announces is not read, by name.
-        messages: how many are sound.
-        identifiers: of the topic of each sound data message, in the order of the file.
+        refused: name of a topic that is not read -> reason.
+        messages: number of sound messages.
+        identifiers: identifier of the topic of each sound data message, in the order of the file.
         size: of the file, bytes.
     """
 
@@ -63,7 +63,7 @@ class Scan:
 
 
 class _Types:
-    """Formats and topics met so far; knows how large a message must be."""
+    """Formats and topics so far, and the size of their messages."""
 
     def __init__(self) -> None:
         self.formats: dict[str, list[tuple[str, int, str]]] = {}
@@ -77,7 +77,7 @@ class _Types:
         self.formats[name] = [(kind, int(count or 0), label) for kind, count, label in _FIELD.findall(fields)]
 
     def announce(self, identifier: int, name: str) -> str:
-        """Adds a topic; "" or why it cannot be read."""
+        """Add a topic; returns "" or the reason why it cannot be read."""
         reason = self._refusal(identifier, name)
         self.names[identifier] = name
         if reason:
@@ -102,7 +102,7 @@ class _Types:
         return ""
 
     def _extent(self, name: str, depth: int) -> tuple[int, int]:
-        """Bytes and fields of a type; (0, 0) if it has none or too many, contains itself or an unknown type."""
+        """Bytes and fields of a type; (0, 0) if it is empty, too large, recursive or has an unknown type."""
         if depth > _DEEPEST_NESTING:
             return 0, 0
         size = count = 0
@@ -117,7 +117,7 @@ class _Types:
         return size, count
 
     def _padding(self, name: str) -> int:
-        """Bytes at the end that the logger leaves out."""
+        """Bytes of padding at the end, which the logger leaves out."""
         total = 0
         for kind, length, label in reversed(self.formats[name]):
             if not label.startswith("_padding") or kind not in TYPE_SIZES:
@@ -134,7 +134,7 @@ def scan(data: bytes) -> Scan:
     view = memoryview(data)
     kept: list[memoryview | bytes] = []  # runs of sound messages before `start`
     position, start, size = HEADER_BYTES, HEADER_BYTES, len(data)
-    limit = HEADER_BYTES  # no message reaches beyond this: the end of the file, or of the part before appended data
+    limit = HEADER_BYTES  # no message ends after this: end of the file or of the part before appended data
     unpack = struct.Struct("<HB").unpack_from
     two = struct.Struct("<H").unpack_from
     topics = types.topics
@@ -161,7 +161,7 @@ def scan(data: bytes) -> Scan:
                         continue
                 if not sound:
                     sound, keep = _check(data, position, length, kind, types, found)
-                    if sound and not keep:  # pyulog is not to see it
+                    if sound and not keep:  # not passed to pyulog
                         found.messages += 1
                         kept.append(view[start:position])
                         start = position = after
@@ -181,12 +181,12 @@ def scan(data: bytes) -> Scan:
 
 
 def _without_padding(data: bytes, at: int, size: int) -> bytes:
-    """A data message as the logger of PX4 writes it: without the padding at its end, which pyulog does not expect."""
+    """A data message as the logger of PX4 writes it: without the padding at its end, as pyulog expects."""
     return struct.pack("<HB", size + 2, 0x44) + data[at + 3 : at + 5 + size]
 
 
 def _check(data: bytes, at: int, length: int, kind: int, types: _Types, found: Scan) -> tuple[bool, bool]:
-    """Whether a message that is not plainly data is sound, and whether pyulog is to see it; takes note of formats."""
+    """Whether another message is sound, and whether to pass it to pyulog; stores formats and topics."""
     body = data[at + 3 : at + 3 + length]
     if kind == 0x44:
         return length > 2 and int.from_bytes(body[:2], "little") in types.refused_ids, False
@@ -194,12 +194,12 @@ def _check(data: bytes, at: int, length: int, kind: int, types: _Types, found: S
         return False, False
     if kind == 0x46:  # 'F'
         if types.names:
-            return True, False  # too late: definitions come first
+            return True, False  # too late: formats must come before topics
         types.define(body.decode("ascii"))
     elif kind == 0x41:  # 'A'
         name, identifier = body[3:].decode("ascii"), int.from_bytes(body[1:3], "little")
         if types.names.get(identifier) == name:
-            return True, False  # announced once more, in appended data
+            return True, False  # repeated in appended data
         reason = types.announce(identifier, name)
         if reason:
             found.refused[name] = reason
@@ -234,7 +234,7 @@ def _plausible(body: bytes, kind: int, at: int) -> bool:
 
 
 def _key_value(body: bytes) -> bool:
-    """Length of key, key ("char[5] name"), value of the size that the key's type says."""
+    """Whether a body is: length of key, key ("char[5] name"), value of the size of the type."""
     if len(body) < 2 or len(body) < 1 + body[0]:
         return False
     key = _KEY.match(body[1 : 1 + body[0]])
@@ -244,7 +244,7 @@ def _key_value(body: bytes) -> bool:
 
 
 def _resume(data: bytes, damaged: int, limit: int, types: _Types) -> int:
-    """The next place after `damaged` where sound messages follow each other up to `limit`; else that."""
+    """Offset of the next consecutive sound messages after `damaged`; `limit` if there are none."""
     for match in _CANDIDATE.finditer(data, damaged + 2, limit):
         start = match.start() - 1
         position = start
@@ -265,7 +265,7 @@ def _resume(data: bytes, damaged: int, limit: int, types: _Types) -> int:
 
 
 def _sound(data: bytes, at: int, length: int, kind: int, types: _Types) -> bool:
-    """As `_check`, without taking note of anything."""
+    """As `_check`, without storing anything."""
     if kind == 0x44:
         if length <= 2:
             return False
@@ -278,7 +278,7 @@ def _sound(data: bytes, at: int, length: int, kind: int, types: _Types) -> bool:
 
 
 def _appended(data: bytes) -> tuple[bool, tuple[int, ...]]:
-    """Whether the file needs no other header, and the offsets at which data was appended to it."""
+    """Whether the header can stay unchanged, and the offsets of appended data."""
     if data[HEADER_BYTES + 2 : HEADER_BYTES + 3] != b"B" or len(data) < HEADER_BYTES + 43:
         return True, ()
     flags = data[HEADER_BYTES + 11 : HEADER_BYTES + 19]
@@ -287,7 +287,7 @@ def _appended(data: bytes) -> tuple[bool, tuple[int, ...]]:
 
 
 def unknown_flags(data: bytes) -> bool:
-    """True if the file says that readers of today must not read it."""
+    """True if the file has incompatible flags that this reader does not know."""
     if data[HEADER_BYTES + 2 : HEADER_BYTES + 3] != b"B" or len(data) < HEADER_BYTES + 43:
         return False
     flags = data[HEADER_BYTES + 11 : HEADER_BYTES + 19]
