@@ -1,8 +1,8 @@
-"""ROS 2 messages from the bytes in a bag to columns of numbers, with the definitions that the bag itself carries.
+"""Decode ROS 2 messages of a bag to columns of numbers, with the message definitions in the bag.
 
-Decoding CDR is that of rosbags. It makes Python code from a definition and believes it: an array of a claimed length of
-things that take no bytes would keep it busy for ever. So a definition is first reduced to its fields, whose names are
-plain words, and refused where decoding could take more steps than the message has bytes.
+rosbags decodes CDR: it makes Python code from a definition and trusts the definition. A long array of elements without
+bytes would never end. So this module first reduces a definition to its fields, whose names are plain words. It refuses
+a definition if decoding could take many more steps than a message has bytes.
 
 Formats: design.ros2.org/articles/legacy_interface_definition.html, OMG CDR.
 """
@@ -22,7 +22,7 @@ from rosbags.typesys.store import Typestore
 
 LARGEST_MESSAGE = 1 << 16  # bytes; larger ones are images, maps and point clouds
 _LARGEST_DEFINITION = 1 << 18  # characters
-_MOST_FIELDS = 2000  # of a message, with all that is nested in it
+_MOST_FIELDS = 2000  # of a message, with nested ones
 _DEEPEST_NESTING = 16
 _LARGEST_FIXED_ARRAY = 16  # elements of an array of fixed length that become columns; covariances have 36
 _LONGEST_SEQUENCE = 64  # elements of a sequence that become columns
@@ -39,11 +39,11 @@ _Spec = dict[str, list[tuple[str, bool, int, str]]]  # type -> (type, array, fix
 
 @dataclass(frozen=True, slots=True)
 class MessageType:
-    """How to read messages of one type.
+    """A message type and its decoder.
 
     Attributes:
         name: "geometry_msgs/PoseStamped".
-        decode: from the bytes of a message to an object with its fields.
+        decode: function from the bytes of a message to an object with its fields.
         scalars: dotted names of the numbers.
         arrays: dotted names and lengths of arrays of numbers; length 0 for sequences.
         strings: dotted names of the texts.
@@ -58,9 +58,9 @@ class MessageType:
     stamped: bool
 
 
-@functools.lru_cache(maxsize=64)  # making the code of a decoder takes longer than reading a short bag
+@functools.lru_cache(maxsize=64)  # making a decoder takes longer than reading a short bag
 def message_type(name: str, definition: str) -> MessageType:
-    """From the name and the definition in a bag. Raises ValueError with the reason why it cannot be read."""
+    """The message type from its name and definition in a bag. Raises ValueError with the reason if not readable."""
     if len(definition) > _LARGEST_DEFINITION:
         raise ValueError("its definition is too long")
     short = _short(name)
@@ -68,7 +68,7 @@ def message_type(name: str, definition: str) -> MessageType:
     _check(short, spec)
     try:
         decode = _decoder(f"{short.replace('/', '/msg/')}", text)
-    except Exception as error:  # the parser has many of its own
+    except Exception as error:  # the parser raises many kinds
         raise ValueError(f"its definition cannot be parsed ({type(error).__name__})") from error
     scalars: list[str] = []
     arrays: list[tuple[str, int]] = []
@@ -80,16 +80,16 @@ def message_type(name: str, definition: str) -> MessageType:
 
 
 def _decoder(name: str, text: str) -> Callable[[bytes], Any]:
-    """From the bytes of a message of the type "package/msg/Name" to an object with its fields."""
-    store = get_typestore(Stores.EMPTY)  # it knows times and durations
+    """The function from the bytes of a message of type "package/msg/Name" to an object with its fields."""
+    store = get_typestore(Stores.EMPTY)  # has the types of times and durations
     types = get_types_from_msg(text, name)
     store.register({kind: fields for kind, fields in types.items() if kind not in store.fielddefs})
-    store.get_msgdef(name)  # which makes the code now
+    store.get_msgdef(name)  # makes the code now
     return functools.partial(store.deserialize_cdr, typename=name)
 
 
 def standard_definition(name: str) -> str | None:
-    """The definition of a type that bags from before 2023 do not carry; None if it is not known here."""
+    """The definition of a type for bags without definitions (older than 2023); None if unknown."""
     try:
         package, _, kind = _short(name).partition("/")
         return _standard().generate_msgdef(f"{package}/msg/{kind}", ros_version=2)[0]
@@ -122,7 +122,7 @@ CRAZYFLIE: dict[str, str] = {
 
 
 def _short(name: str) -> str:
-    """ "geometry_msgs/msg/Pose" and "geometry_msgs/Pose" are one."""
+    """The short form "geometry_msgs/Pose" of "geometry_msgs/msg/Pose" or of itself."""
     parts = name.split("/")
     if not 2 <= len(parts) <= 3 or not all(re.fullmatch(r"\w{1,100}", p) for p in parts):
         raise ValueError("its name is none of a ROS 2 message")
@@ -130,7 +130,7 @@ def _short(name: str) -> str:
 
 
 def _reduced(name: str, definition: str) -> tuple[str, _Spec]:
-    """The definition without what nobody reads (comments, constants, defaults), and as a table."""
+    """The definition without comments, constants and defaults, as text and as a table."""
     spec: _Spec = {name: []}
     lines: list[str] = []
     current, package = name, name.partition("/")[0]
@@ -156,7 +156,7 @@ def _reduced(name: str, definition: str) -> tuple[str, _Spec]:
 
 
 def _type_of(text: str, package: str) -> tuple[str, bool, int]:
-    """Type, whether it is an array, and its length if that is fixed."""
+    """Type, whether it is an array, and its fixed length or 0."""
     base, bracket, size = text.partition("[")
     base = base.partition("<=")[0]
     if base not in _PRIMITIVE:
@@ -166,11 +166,11 @@ def _type_of(text: str, package: str) -> tuple[str, bool, int]:
 
 
 def _check(name: str, spec: _Spec) -> None:
-    """Raise ValueError unless the steps of decoding are few, or at most four for each byte that a message must have."""
+    """Raise ValueError if decoding takes more than `_MOST_FIELDS` steps, or more than four per byte of a sequence."""
     counted: dict[str, tuple[int, int]] = {}
 
     def measure(kind: str, depth: int) -> tuple[int, int]:
-        """Steps that reading one takes, elements of sequences not counted, and the bytes without which it fails."""
+        """Steps to decode one message without elements of sequences, and its least number of bytes."""
         if kind in _TIMES and kind not in spec:
             return 2, 8
         if kind in counted:
@@ -186,7 +186,7 @@ def _check(name: str, spec: _Spec) -> None:
                 if base not in _PRIMITIVE and one > 4 * bytes_of_one:
                     raise ValueError("its definition has a sequence of things of hardly any size")
                 steps, size = steps + one, size + 4
-            elif array and base in _PRIMITIVE:  # read at once, or an element at a time as far as there are bytes
+            elif array and base in _PRIMITIVE:  # one step, or one per element while bytes remain
                 steps, size = steps + 1, size + (0 if base in ("uint8", "byte") else length * bytes_of_one)
             else:
                 steps, size = steps + one * max(length, 1), size + bytes_of_one * max(length, 1)
@@ -201,7 +201,7 @@ def _check(name: str, spec: _Spec) -> None:
 def _leaves(
     kind: str, spec: _Spec, prefix: str, scalars: list[str], arrays: list[tuple[str, int]], strings: list[str]
 ) -> None:
-    """Dotted names of what a message holds; arrays of messages are left out."""
+    """Collect the dotted names of the fields of a message; arrays of messages are left out."""
     if kind in _TIMES and kind not in spec:
         scalars += [prefix + part for part in _TIMES[kind]]
         return
@@ -223,10 +223,10 @@ class Rows:
 
     Attributes:
         columns: dotted name -> (n,) numbers; elements of arrays as "values[3]", NaN beyond the end of a short one.
-        stamp: (n,) ns since 1970 of `header.stamp`, 0 where there is none.
-        log: (n,) ns since 1970 at which the recorder got the message.
-        objects: the messages, where asked for.
-        broken: messages that could not be decoded.
+        stamp: (n,) `header.stamp`, ns since 1970, 0 if absent.
+        log: (n,) time of arrival at the recorder, ns since 1970.
+        objects: the decoded messages, if requested.
+        broken: number of messages that could not be decoded.
         texts: dotted name -> text in the first message.
     """
 
@@ -239,7 +239,7 @@ class Rows:
 
 
 def rows_of(kind: MessageType, messages: Sequence[tuple[int, bytes]], *, keep: bool = False) -> Rows:
-    """Decode (log time [ns], bytes) of one topic; `keep` keeps the objects for what is not a plain column."""
+    """Decode (log time [ns], bytes) of one topic; `keep` also keeps the objects, for fields that are no columns."""
     numbers: list[tuple[Any, ...]] = []
     lists: list[tuple[Any, ...]] = []
     stamps: list[int] = []
@@ -255,7 +255,7 @@ def rows_of(kind: MessageType, messages: Sequence[tuple[int, bytes]], *, keep: b
             row = get_numbers(message)
             parts = get_lists(message)
             stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec if kind.stamped else 0
-        except Exception:  # of any kind, from the code that rosbags makes, on bytes that are no message of the type
+        except Exception:  # the code of rosbags raises many kinds on invalid bytes
             broken += 1
             continue
         if not logs:
@@ -274,7 +274,7 @@ def rows_of(kind: MessageType, messages: Sequence[tuple[int, bytes]], *, keep: b
 
 
 def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple[Any, ...]]:
-    # rosbags adds a line to names that mean something in Python
+    # rosbags adds an underscore to names that are Python keywords
     names = tuple(".".join(p + "_" * keyword.iskeyword(p) for p in name.split(".")) for name in names)
     if not names:
         return lambda message: ()
@@ -285,7 +285,7 @@ def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple[Any, ...]]:
 
 
 def _array_columns(name: str, length: int, lists: list[Any]) -> dict[str, NDArray[np.float64]]:
-    """A column an element; NaN where a sequence has fewer."""
+    """One column per element; NaN beyond the end of a sequence."""
     longest = length or min(max((len(x) for x in lists), default=0), _LONGEST_SEQUENCE)
     table = np.full((len(lists), longest), np.nan)
     for i, values in enumerate(lists):

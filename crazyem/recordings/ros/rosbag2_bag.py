@@ -1,8 +1,8 @@
-"""rosbag2 recordings (MCAP or SQLite): crazyswarm2's topics of one robot, and what other ROS 2 drones have in common.
+"""Read rosbag2 recordings (MCAP or SQLite): topics of crazyswarm2 for one robot, and common topics of ROS 2 drones.
 
-Two clocks: messages of log blocks (LogDataGeneric) carry the firmware's; all others are stamped by the host. Where the
-firmware's is there, it is the time axis. What becomes which signal is in `rosbag2_signals`; docs: rosbag2.md
-explains both, and the mapping file that says what a bag cannot: which variables are in a log block. Sources:
+There are two clocks: messages of log blocks (LogDataGeneric) have firmware stamps, all others have host stamps. The
+firmware clock is the time axis if present. `rosbag2_signals` maps topics to signals. docs: rosbag2.md explains both,
+and the mapping file with the variables of log blocks, which a bag does not contain. Sources:
 IMRCLab/crazyswarm2 (crazyflie_interfaces/msg, crazyflie/src/crazyflie_server.cpp, crazyflie/scripts), mcap.dev.
 """
 
@@ -27,16 +27,16 @@ from crazyem.recordings.topics import text_of
 from crazyem.toml_file import read_toml
 
 _SQLITE = b"SQLite format 3\0"
-_LARGEST_UNPACKED, _LARGEST_RATIO = 1 << 30, 200  # bytes of a file unpacked, and beyond them a packed byte
-_LARGEST_TOTAL = 2 << 30  # bytes of messages that are kept for decoding
+_LARGEST_UNPACKED, _LARGEST_RATIO = 1 << 30, 200  # bytes of a file unpacked; further ones per packed byte
+_LARGEST_TOTAL = 2 << 30  # bytes of messages in memory for decoding
 _MOST_FILES = 10_000
 _MAPPING_KEYS = {"robot": str, "twist": str, "topics": dict}
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
-    """Read the flight of one robot from a bag, a file or the folder of one.
+    """Read the flight of one robot from the file or the folder of a bag.
 
-    Raises: FileFormatError naming the file and what is wrong; UsageError if it must be said which robot is meant.
+    Raises: FileFormatError naming the file and the reason; UsageError if the user must choose a robot.
     """
     mapping = _user_mapping(options.mapping)
     bag = _Bag()
@@ -53,7 +53,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
 
 def _files(path: Path) -> list[Path]:
-    """The MCAP files of a bag in the order in which they were written; a folder itself where these are of SQLite."""
+    """The MCAP files of a bag in the order of writing; for SQLite files the folder itself."""
     if path.is_file():
         return [path]
     names = sorted(
@@ -75,19 +75,19 @@ def _is_sqlite(path: Path) -> bool:
 
 @dataclass(slots=True)
 class _Bag:
-    """Everything that one or several files hold for us."""
+    """The topics and problems of all files of a bag."""
 
     topics: dict[str, BagTopic] = field(default_factory=dict)
     problems: list[tuple[Path, Problem]] = field(default_factory=list)
     refused: dict[str, str] = field(default_factory=dict)  # topic -> why
-    large: dict[str, int] = field(default_factory=dict)  # topic -> messages that were too large
+    large: dict[str, int] = field(default_factory=dict)  # topic -> number of messages that are too large
     damage: list[Finding] = field(default_factory=list)
     kept: int = 0
     count: int = 0
     _types: dict[tuple[str, str], MessageType | str] = field(default_factory=dict)
 
     def add(self, path: Path) -> None:
-        """Read one file to its end, or as far as it is sound."""
+        """Read the sound parts of an MCAP file."""
         problems: list[Problem] = []
         channels: dict[int, BagTopic | None] = {}
         schemas: dict[int, Schema] = {}
@@ -105,7 +105,7 @@ class _Bag:
         self.problems += [(path, problem) for problem in problems]
 
     def add_sqlite(self, path: Path) -> None:
-        """Read an SQLite file, or the folder of a bag with several, to its end or as far as it is sound."""
+        """Read an SQLite file, or the folder of a bag with several, up to the first damage."""
         if path.is_file() and path.suffix != ".db3":
             raise FileFormatError(f"{path}: a bag in SQLite storage is read where its name ends in .db3.")
         before = self.count
@@ -118,7 +118,7 @@ class _Bag:
                         self._take(path, topic, log, bytes(payload))
         except CrazyemError:
             raise
-        except Exception as error:  # of rosbags and of SQLite, of many kinds
+        except Exception as error:  # rosbags and SQLite raise many kinds
             if self.count == before:
                 raise FileFormatError(f"{path}: the bag cannot be read ({error}).") from error
             text = f"{path.name} is damaged after {self.count - before} messages ({error})."
@@ -176,7 +176,7 @@ class _Bag:
         return known
 
     def why_nothing(self) -> str:
-        """In a few words."""
+        """Why the bag has no messages, in a few words."""
         real = [problem for _, problem in self.problems if problem.loss is not Loss.OPEN]
         if real:
             return f"byte {real[0].offset}: {real[0].why}"
@@ -203,7 +203,7 @@ class _Bag:
 
 
 def _owner(topic: str) -> str:
-    """Robot of a topic: "cf1" of "/cf1/pose", "" of "/pose"."""
+    """Robot of a topic: "cf1" for "/cf1/pose", "" for "/pose"."""
     parts = topic.strip("/").split("/")
     return parts[0] if len(parts) > 1 else ""
 
@@ -227,7 +227,7 @@ def _robot(path: Path, bag: _Bag, mapping: BagMapping) -> tuple[str, list[Findin
 
 
 def _user_mapping(file: str | None) -> BagMapping:
-    """What the user's mapping file says of a bag. Raises UsageError or FileFormatError."""
+    """The mapping file of the user. Raises UsageError or FileFormatError."""
     if file is None:
         return BagMapping()
     table = read_toml(file, what="mapping")

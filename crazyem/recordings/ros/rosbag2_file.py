@@ -1,4 +1,4 @@
-"""rosbag2 recordings (MCAP or SQLite): which files and folders are bags; `rosbag2_bag` reads them, with rosbags."""
+"""Recognise rosbag2 recordings (MCAP or SQLite), files and folders; `rosbag2_bag` reads them with rosbags."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ _METADATA = "metadata.yaml"
 
 
 def recognises(head: bytes) -> bool:
-    """True for MCAP of the profile "ros2" or with its schemas, and for a bag in an SQLite file."""
+    """True for MCAP with profile "ros2" or ROS 2 schemas, and for a bag in an SQLite file."""
     if head.startswith(_SQLITE):
         return b"topics" in head and b"messages" in head
     if not head.startswith(MCAP_MAGIC):
@@ -33,9 +33,9 @@ def recognises_folder(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
-    """Read the flight of one robot from a bag, a file or the folder of one.
+    """Read the flight of one robot from the file or the folder of a bag.
 
-    Raises: FileFormatError naming the file and what is wrong; UsageError if it must be said which robot is meant;
+    Raises: FileFormatError naming the file and the reason; UsageError if the user must choose a robot;
     MissingExtraError without rosbags.
     """
     require("rosbags", "Reading a ROS 2 bag")

@@ -1,4 +1,4 @@
-"""From the decoded topics of a bag to a recording: clocks, log blocks with their variables, types with a meaning."""
+"""The recording from the decoded topics of a bag: clocks, log blocks and their variables, known message types."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,21 +27,21 @@ _STATUS = "crazyflie_interfaces/Status"
 _FULL_STATE = "crazyflie_interfaces/FullState"
 _ODOMETRY = "nav_msgs/Odometry"
 _TF, _MOCAP = "tf2_msgs/TFMessage", "motion_capture_tracking_interfaces/NamedPoseArray"
-# types by which a namespace is known to be a robot's
+# message types that show that a namespace belongs to a robot
 ROBOT_TYPES = {
     *(_LOG, _STATUS, _FULL_STATE, _ODOMETRY),
     *("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped", "sensor_msgs/Imu"),
 }
-WORLD_TOPICS = {"/tf", "/poses"}  # of all robots
+WORLD_TOPICS = {"/tf", "/poses"}  # topics with all robots
 _FLYING_BIT = 16  # supervisor.info
 _NS = 1_000_000_000
-_SAME_EPOCH = 3600 * _NS  # a stamp further from the time of recording is of a simulation or an unset clock
+_SAME_EPOCH = 3600 * _NS  # a stamp further from the log time is from a simulation or an unset clock
 _XYZ, _XYZW = "xyz", "xyzw"
 
 
 @dataclass(slots=True)
 class BagTopic:
-    """The messages of a topic: (log time [ns], bytes), and the place of each among all of the bag."""
+    """The messages of a topic: (log time [ns], bytes), and their places among all messages of the bag."""
 
     name: str
     kind: MessageType
@@ -51,7 +51,7 @@ class BagTopic:
 
 @dataclass(frozen=True, slots=True)
 class BagMapping:
-    """What the user says of a bag: in which file, which robot, the frame of twists, variables by topic."""
+    """The mapping of the user for a bag: its file, the robot, the frame of twists, variables by topic."""
 
     file: str | None = None
     robot: str | None = None
@@ -61,7 +61,7 @@ class BagMapping:
 
 @dataclass(eq=False)
 class _Decoded:
-    """A topic's numbers, its place in the order of the bag, and its times on the axis of the recording."""
+    """The numbers of a topic, their order in the bag, and their times on the axis of the recording."""
 
     topic: BagTopic
     rows: Rows
@@ -71,20 +71,20 @@ class _Decoded:
 
     @cached_property
     def unknown(self) -> NDArray[np.bool_]:
-        """(n,) True where a message has no stamp, or one that is far from when it was recorded."""
+        """(n,) True where a message has no stamp, or a stamp far from its log time."""
         own, log = self.rows.stamp, self.rows.log
         return (own <= 0) | (np.abs(own - log) > _SAME_EPOCH)
 
     @property
     def moved(self) -> bool:
-        """Whether a few messages are placed by when they were recorded, and not all."""
+        """Whether some messages, but less than half, are placed by their log time."""
         return bool(self.unknown.any()) and 2 * int(self.unknown.sum()) < self.unknown.size
 
     @property
     def stamps(self) -> NDArray[np.int64]:
-        """(n,) ns: the messages' own stamps; when they were recorded, if most have none or are of another epoch.
+        """(n,) ns: the stamps of the messages, or their log times if most stamps are absent or far from these.
 
-        A message without a stamp among others is placed by when it was recorded, less the median delay of the others.
+        If only a few stamps are unknown, these messages have the log time minus the median delay of the others.
         """
         own, log = self.rows.stamp, self.rows.log
         if not self.unknown.any():
@@ -95,7 +95,7 @@ class _Decoded:
         return np.where(self.unknown, log - delay, own)
 
     def fault(self) -> Fault:
-        """What is wrong with the stamps of the topic."""
+        """The fault of the unknown stamps of the topic."""
         example = float(self.rows.stamp[self.unknown][0]) / _NS
         return Fault(_label(self), int(self.unknown.sum()), self.unknown.size, "placed by arrival", example)
 
@@ -108,7 +108,7 @@ def recording_of(
     motor: str | None,
     findings: tuple[Finding, ...],
 ) -> Recording:
-    """The recording of one robot. Raises FileFormatError where there is nothing or the mapping does not fit."""
+    """The recording of one robot. Raises FileFormatError if the bag has no data or the mapping does not fit."""
     decoded = [d for d in (_decode(topic, robot) for topic in topics) if d is not None]
     if not decoded:
         raise FileFormatError(f"{path}: the bag holds not a single sound message of a robot.")
@@ -131,7 +131,7 @@ def recording_of(
         twist_notes.append(_PYTHON_SERVER)
     mapped.sort(key=lambda m: _PREFERRED.get(m.origin, 0))
     have = {*firmware, *(m.quantity for m in mapped if not m.origin)}
-    # a pose from outside is the pose where there is no other
+    # an external pose becomes the pose if there is no other
     mapped = [m if m.quantity in have else replace(m, origin="") for m in mapped]
     rest, left_out = signals_of(others, mapped)
     signals = _together(firmware, rest, {_label(d): d.order for d in decoded})
@@ -179,7 +179,7 @@ def _label(d: _Decoded) -> str:
 
 
 def _decode(topic: BagTopic, robot: str) -> _Decoded | None:
-    """The numbers of a topic, None if there are none; of topics of all robots those of this one."""
+    """The numbers of a topic, None without any; from topics with all robots only those of this robot."""
     keep = topic.kind.name in (_TF, _MOCAP)
     if not (keep or topic.kind.scalars or topic.kind.arrays):
         return None
@@ -190,7 +190,7 @@ def _decode(topic: BagTopic, robot: str) -> _Decoded | None:
 
 
 def _of_robot(rows: Rows, kind: str, robot: str) -> Rows:
-    """Poses of one robot from messages that hold those of many."""
+    """Poses of one robot from messages with many robots."""
     values: list[tuple[float, ...]] = []
     stamps: list[int] = []
     logs: list[int] = []
@@ -214,7 +214,7 @@ def _of_robot(rows: Rows, kind: str, robot: str) -> Rows:
 
 
 def _place(decoded: list[_Decoded]) -> tuple[float, list[Finding], dict[str, str]]:
-    """Put every topic on one axis; returns its origin [s], what to know about it, and the constants behind it."""
+    """Put every topic on one time axis; returns its origin [s], findings about it, and its constants as metadata."""
     logs = [d for d in decoded if d.topic.kind.name == _LOG and "timestamp" in d.rows.columns]
     if not logs:
         first = min(int(d.stamps.min()) for d in decoded) // _NS
@@ -239,10 +239,10 @@ def _place(decoded: list[_Decoded]) -> tuple[float, list[Finding], dict[str, str
 
 
 def _unwrap(logs: list[_Decoded]) -> None:
-    """Firmware times [s] of log blocks: a packet's 24 bits of milliseconds made continuous, all blocks on one clock."""
+    """Set the firmware times [s] of log blocks: unwrapped 24-bit milliseconds, all blocks on one clock."""
     stamps = np.concatenate([d.rows.columns["timestamp"] for d in logs]).astype(np.int64)
     small = stamps < STAMP_MODULUS
-    if 2 * int(small.sum()) > small.size:  # a few that are not cannot be; if most are not, somebody unwrapped them
+    if 2 * int(small.sum()) > small.size:  # most stamps have 24 bits; else they are unwrapped already
         order = np.argsort(np.concatenate([d.order for d in logs]))
         order = order[small[order]]
         unwrapper = StampUnwrapper()
@@ -253,7 +253,7 @@ def _unwrap(logs: list[_Decoded]) -> None:
 
 
 def _tables(logs: list[_Decoded], mapping: BagMapping) -> tuple[list[Table], list[Finding]]:
-    """Log blocks whose variables the user named, as tables of firmware variables; a finding for each other one."""
+    """Tables of firmware variables from log blocks whose variables the user names; a finding for each other block."""
     tables, notes = [], []
     for d in logs:
         values = [c for c in d.rows.columns if c.startswith("values[")]
@@ -286,7 +286,7 @@ def _topic(d: _Decoded) -> Topic:
 def _together(
     firmware: dict[str, SignalArray], rest: dict[str, SignalArray], order: Mapping[str, NDArray[np.int64]]
 ) -> dict[str, SignalArray]:
-    """Signals of log blocks first, the others under another name where they measure the same; one order for all."""
+    """Signals of log blocks, then the others, which are renamed if they measure the same; one order for all."""
     signals = dict(firmware)
     for name, array in rest.items():
         signals[f"{name}@{array.stream}" if name in signals else name] = array
@@ -298,7 +298,7 @@ def _together(
 
 
 def _no_attitude(prefix: str) -> Callable[[Topic], NDArray[np.bool_]]:
-    """Rows whose quaternion is all zeros, or whose covariance says that there is none (sensor_msgs/Imu)."""
+    """Function for the rows with a zero quaternion, or with covariance -1 for "no attitude" (sensor_msgs/Imu)."""
 
     def absent(topic: Topic) -> NDArray[np.bool_]:
         rows = ~stacked([topic.columns[prefix + c] for c in _XYZW]).any(axis=1)
@@ -320,7 +320,7 @@ def _pose(prefix: str, origin: str = "") -> tuple[Source, Source]:
     return place, _source("attitude", prefix + "orientation.", _XYZW, origin=origin)
 
 
-# type of messages -> signals of the vocabulary, of whichever topic
+# type of messages -> signals of the vocabulary, in any topic
 _MEANING: Mapping[str, tuple[Source, ...]] = {
     "geometry_msgs/PoseStamped": _pose("pose."),
     "geometry_msgs/PoseWithCovarianceStamped": _pose("pose.pose."),
@@ -362,7 +362,7 @@ def _of(topic: Topic, *sources: Source) -> list[Mapped]:
 def _twist(
     d: _Decoded, topic: Topic, pose: Sequence[Mapped], mapping: BagMapping, notes: list[Finding]
 ) -> Iterator[Mapped]:
-    """Velocity in the world and body rate. crazyswarm2's C++ server leaves rates at 0 and the child frame empty."""
+    """World velocity and body rate from odometry. The C++ server of crazyswarm2 sets rates 0 and no child frame."""
     attitude = next((m.value for m in pose if m.quantity == "attitude"), None)
     child = d.rows.texts.get("child_frame_id", "")
     frame = mapping.twist or ("body" if child else "world")
