@@ -163,7 +163,7 @@ def text_blocks(path: Path, damage: Damage, size: int = BLOCK_BYTES) -> Iterator
 
     A gzip file is unpacked piece by piece. A gzip file that ends early gives the text before its end.
 
-    Raises: FileFormatError if a line is too long, a gzip file is damaged or unpacks to more than `LARGEST_RATIO`;
+    Raises: FileFormatError if a line is too long, a gzip file is damaged or exceeds `LARGEST_RATIO`;
         UsageError if the file cannot be read.
     """
     rest = b""
