@@ -1,4 +1,4 @@
-"""What simulators hold of a drone, in SI: one typed value between a vehicle file and all of their files."""
+"""The constants of a drone that simulators use, in SI: one type between a vehicle file and all simulator files."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -10,15 +10,15 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.motion import active, body_of, gain, vehicle_values
 from crazyem.vehicle import GRAVITY, Vehicle
 
-SHORTEST_LAG = 1e-3  # s: simulators divide by the lag, so none is written as this one, and this one is read as none
+SHORTEST_LAG = 1e-3  # s: stands for a lag of 0 in files, because simulators divide by the lag; read back as 0
 
 
 @dataclass(frozen=True)
 class Constants:
-    """A quadrotor in SI; None: not said. Body axes x forward, y left, z up, origin in the middle of the rotors.
+    """A quadrotor in SI; None: unknown. Body axes x forward, y left, z up, origin in the middle of the rotors.
 
     Attributes:
-        name: what it is called.
+        name: of the drone.
         mass: kg.
         inertia_xx, ..., inertia_yz: elements of the matrix about the centre of mass [kg m^2].
         centre_x, centre_y, centre_z: centre of mass from the middle of the rotors [m].
@@ -60,7 +60,7 @@ class Constants:
     damping_z: float | None = None
 
     def or_(self, quantity: str, default: float) -> float:
-        """A quantity, or a default where it is not said."""
+        """The value of a quantity, or a default if the value is unknown."""
         value = getattr(self, quantity)
         return default if value is None else float(value)
 
@@ -76,7 +76,7 @@ def hover_speed(c: Constants) -> float:
 
 
 def _needs(*names: str) -> Callable[[Callable[..., float]], Callable[[Constants], float]]:
-    """A function of quantities, as one of constants that is NaN where a quantity is not said."""
+    """Decorator: a function of quantities becomes a function of `Constants`, NaN if a quantity is unknown."""
 
     def wrap(function: Callable[..., float]) -> Callable[[Constants], float]:
         def of(c: Constants) -> float:
@@ -88,7 +88,7 @@ def _needs(*names: str) -> Callable[[Callable[..., float]], Callable[[Constants]
     return wrap
 
 
-# What files hold that follows from the constants: quantity -> its value.
+# Quantities in files that follow from the constants: quantity -> function of the constants.
 DERIVED: dict[str, Callable[[Constants], float]] = {
     "torque_per_speed2": _needs("thrust_per_speed2", "torque_per_thrust")(lambda k, r: k * r),
     "speed_max": _needs("thrust_max", "thrust_per_speed2")(lambda t, k: math.sqrt(t / k)),
@@ -107,7 +107,7 @@ DERIVED: dict[str, Callable[[Constants], float]] = {
     "rotor_drag_z": _needs("drag_z", "hover_speed")(lambda z, w: z / (4.0 * w)),
 }
 
-# The same the other way: a quantity, what it follows from, and how; the first that can be done is done.
+# The inverse of DERIVED: quantity, quantities that give it, formula. The first formula with known inputs applies.
 SOLVED: tuple[tuple[str, tuple[str, ...], Callable[..., float]], ...] = (
     ("mass", ("weight",), lambda w: w / GRAVITY),
     ("torque_per_thrust", ("torque_per_speed2", "thrust_per_speed2"), lambda q, k: q / k),
@@ -128,12 +128,12 @@ SOLVED: tuple[tuple[str, tuple[str, ...], Callable[..., float]], ...] = (
 
 
 def value_of(c: Constants, quantity: str) -> float:
-    """A quantity or one that follows from others; NaN where it is not said."""
+    """The value of a quantity of `Constants` or `DERIVED`; NaN if unknown."""
     return DERIVED[quantity](c) if quantity in DERIVED else c.or_(quantity, math.nan)
 
 
 def solved(found: Mapping[str, float]) -> dict[str, float]:
-    """Quantities of a file with those that follow from them."""
+    """The quantities of a file, and all quantities that follow from them by `SOLVED`."""
     values = dict(found)
     for target, needs, function in SOLVED:
         if target not in values and all(n in values for n in needs):
@@ -145,9 +145,9 @@ def solved(found: Mapping[str, float]) -> dict[str, float]:
 
 
 def from_vehicle(vehicle: Vehicle) -> tuple[Constants, list[str]]:
-    """The constants of a vehicle, and the names of its effects that are in none of them.
+    """The constants of a vehicle, and the names of its effects that no constant can express.
 
-    Exact: inertia, centre of mass and payload as one body, scales of thrust and torque, the lag, drags and damping.
+    Exact for inertia, centre of mass and payload (one body), scales of thrust and torque, lag, drag and damping.
     """
     effects = active(vehicle.effects, vehicle)
     values, own = {effect.name: given for effect, given in effects}, vehicle_values(vehicle)
@@ -175,13 +175,13 @@ def from_vehicle(vehicle: Vehicle) -> tuple[Constants, list[str]]:
 
 
 def without_effects(vehicle: Vehicle) -> Vehicle:
-    """The vehicle without its effects; what scales the thrust stays, in the law from command to thrust."""
+    """The vehicle without its effects; effects that scale the thrust go into the thrust curve."""
     thrust = gain(active(vehicle.effects, vehicle), "thrust")
     return replace(vehicle, effects={}, thrust_curve=tuple(c * thrust for c in vehicle.thrust_curve))
 
 
 def to_vehicle(c: Constants, base: Vehicle | None = None) -> Vehicle:
-    """The vehicle of constants; what they do not say is that of `base` (its law from command to thrust, above all).
+    """The vehicle with these constants; all else comes from `base`, such as the law from command to thrust.
 
     Raises: ValueError: no mass or no inertia.
     """
@@ -215,7 +215,7 @@ def to_vehicle(c: Constants, base: Vehicle | None = None) -> Vehicle:
 
 
 def inertia_of(c: Constants) -> np.ndarray | None:
-    """(3, 3) kg m^2; None where a moment is not said. Products that are not said are 0."""
+    """Inertia matrix (3, 3) [kg m^2]; None if a moment is unknown. Unknown products are 0."""
     if c.inertia_xx is None or c.inertia_yy is None or c.inertia_zz is None:
         return None
     xy, xz, yz = (c.or_(f"inertia_{a}", 0.0) for a in ("xy", "xz", "yz"))

@@ -1,4 +1,4 @@
-"""From a vehicle to a simulator's file and back, with what the file cannot hold and what that costs."""
+"""Convert a vehicle to a simulator's file and back; report what the file cannot hold and the error this causes."""
 
 import math
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from crazyem.simulators.plausible import impossible, objection
 from crazyem.simulators.registry import FORMATS, OWN, format_named, format_of
 from crazyem.vehicle import Vehicle, preset_names
 
-# What is held or left out together: words, and the quantities.
+# Quantities that a file holds or omits together: words for people, and the quantities.
 GROUPS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("rotor lag", ("lag",)),
     ("centre of mass", ("centre_x", "centre_y", "centre_z")),
@@ -34,8 +34,8 @@ OF_ROTORS = {
     "thrust_per_speed2": "thrust per squared rotor speed", "torque_per_thrust": "torque per thrust",
     "thrust_max": "largest thrust",
 }  # fmt: skip
-HELD = 1e-6  # relative difference up to which a quantity is held
-TOLERANCE_OF_NOTHING = {"centre": 1e-9, "lag": 1e-3}  # m, s: as good as none
+HELD = 1e-6  # relative difference up to which a file counts as holding a quantity
+TOLERANCE_OF_NOTHING = {"centre": 1e-9, "lag": 1e-3}  # m, s: differences up to this count as 0
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class Omission:
     """Something that a file does not hold.
 
     Attributes:
-        name: of the effect or constant; words: for people.
-        cost: distance after half a second with and without it, by quantity; None where it is no part of the motion
-            from rotor thrusts.
-        errors: on a recording, the errors with and without it.
-        why: a clause.
+        name: of the effect or constant. words: name for people.
+        cost: distance between predictions with and without it after half a second, by quantity; on a recording, the
+            increase of the error. None if it does not act on the motion from rotor thrusts.
+        errors: on a recording, the prediction errors with and without it.
+        why: reason, as a clause.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Omission:
 
 @dataclass(frozen=True)
 class Source:
-    """A file that was read: the vehicle, and what is to be known of it."""
+    """A file that was read: its vehicle, format and text."""
 
     vehicle: Vehicle
     format: str
@@ -86,12 +86,12 @@ class Source:
 
 @dataclass(frozen=True)
 class Conversion:
-    """A file that was made.
+    """The result of `convert`.
 
     Attributes:
-        text: of it. format: by name.
-        vehicle: what was to be written. held: what the file says of it.
-        omissions: what it does not hold.
+        text: of the file. format: its name.
+        vehicle: the vehicle to convert. held: the vehicle that the file describes.
+        omissions: effects and constants that the file does not hold.
         contradictions, remarks: of the source.
     """
 
@@ -119,15 +119,15 @@ def load_source(
     base: Vehicle | None = None,
     strict: bool = True,
 ) -> Source:
-    """A preset, a vehicle file or a simulator's file as a vehicle.
+    """Load a preset, a vehicle file or a simulator's file as a vehicle.
 
     Args:
-        form: its format; None: told by content.
-        name: of the drone, where a file has several.
-        base: what a simulator's file does not say.
+        form: format of the file; None: recognised by content.
+        name: of the drone, if a file has several.
+        base: vehicle that gives the values missing in a simulator's file.
         strict: contradictory fields are an error.
 
-    Raises: UsageError: no such file, format or drone. FileFormatError: it cannot be used; the sentence names the field.
+    Raises: UsageError: no such file, format or drone. FileFormatError: unusable file; the message names the field.
     """
     path = str(name_or_path)
     if form in (None, OWN) and path in preset_names():
@@ -162,19 +162,19 @@ def convert(
     flight: Recording | None = None,
     costs: bool = True,
 ) -> Conversion:
-    """A simulator's file of a vehicle.
+    """Write a vehicle as a simulator's file.
 
     Args:
-        to: format by name; `OWN` gives a vehicle file.
-        template: text of a file of that format, of which all else stays.
-        where: its name, for errors.
-        name: of the drone in the file; "": the vehicle's.
-        suffix: of the file that will be written: `.json` makes rotorpy's dict JSON.
-        flight: costs are told by this recording instead of the made flight.
-        costs: whether to tell what the file does not hold.
+        to: name of the format; `OWN` gives a vehicle file.
+        template: text of a file of this format; only the constants in it change.
+        where: name of the template, for errors.
+        name: of the drone in the file; "": the vehicle's name.
+        suffix: of the output file: `.json` makes rotorpy's dict JSON.
+        flight: recording on which costs are computed; None: a synthetic flight.
+        costs: whether to list omissions and their costs.
 
-    Raises: UsageError for an unknown format or drone; FileFormatError if the vehicle lacks what the format needs, or
-        the template cannot be used.
+    Raises: UsageError for an unknown format or drone; FileFormatError if the vehicle lacks a value that the format
+        needs, or the template cannot be used.
     """
     constants, left = from_vehicle(vehicle)
     if to == OWN:
@@ -195,11 +195,11 @@ def convert(
     text = write(form, constants, template=template, where=where, name=name)
     said_there = _held(form, text, where=where, name=name)
     omissions = _omissions(vehicle, constants, left, said_there, flight) if costs else []
-    base = replace(without_effects(vehicle), motor_time_constant=0.0)  # who does not know of a lag has none
+    base = replace(without_effects(vehicle), motor_time_constant=0.0)  # a file without a lag means no lag
     return Conversion(text, to, vehicle, to_vehicle(said_there, base), tuple(omissions))
 
 
-# Key of a vehicle file -> quantity that it gives, and quantities of files that are nothing without it.
+# Key of a vehicle file -> its quantity, and the quantities in simulator files that need it.
 NEEDED = {
     "rotor_constant": ("thrust_per_speed2", ("thrust_per_speed2",)),
     "arm": ("arm_x", ("arm", "arm_x", "arm_length")),
@@ -209,7 +209,7 @@ NEEDED = {
 
 
 def _lacking(form: Format, constants: Constants, name: str) -> str:
-    """A key that a vehicle does not have and a new file cannot be without; "" if there is none."""
+    """A key that a new file of this format needs and the vehicle lacks; "" if there is none."""
     document = form.open(form.skeleton(name or constants.name), "")
     drones = form.names(document)
     used = {f.quantity for f in form.fields(document, drones[0] if drones else "")}
@@ -217,14 +217,14 @@ def _lacking(form: Format, constants: Constants, name: str) -> str:
 
 
 def _held(form: Format, text: str, *, where: str, name: str) -> Constants:
-    """What a file that was written says. Contradictions are its template's own, and stay."""
+    """The constants in a written file. Contradictions of the template stay in the file and are no error."""
     return read(form, text, where=where or f"the {form.name} file", name=name or None, strict=False).constants
 
 
 def _omissions(
     vehicle: Vehicle, full: Constants, left: list[str], held: Constants, flight: Recording | None
 ) -> list[Omission]:
-    """What a file lacks of a vehicle, each with its cost: with all, against with all but this."""
+    """What a file lacks of a vehicle. Each cost compares the complete vehicle with the vehicle without this one."""
     base = without_effects(vehicle)
     kept = {n: vehicle.effects[n] for n in left}
 
@@ -241,7 +241,7 @@ def _omissions(
         said = ", ".join(f"{held.or_(q, 0.0):.3g}" for q in quantities)
         why = "the file has no field for it" if silent else f"the file says {said}"
         if name == "arm" and silent:
-            continue  # of rotors, below
+            continue  # the constants of the rotors follow below
         changed: dict[str, Any] = {q: held.or_(q, 0.0) for q in quantities}
         variants.append((name, words, why, with_left(replace(full, **changed))))
     variants += [(n, n.replace("_", " "), "no simulator here has it", with_left(full, n)) for n in left]
@@ -271,17 +271,17 @@ def _cost(
 
 
 def same(first: Constants, second: Constants, quantities: tuple[str, ...]) -> bool:
-    """Whether quantities agree; one that is not said is nothing."""
+    """Whether the quantities agree; an unknown quantity counts as 0."""
     pairs = [(first.or_(q, 0.0), second.or_(q, 0.0)) for q in quantities]
     scale = max(max(abs(a), abs(b)) for a, b in pairs)
     floor = TOLERANCE_OF_NOTHING.get(quantities[0].split("_")[0], 0.0)
-    # products of inertia are small or large against moments, not against themselves
+    # products of inertia are compared with the moments of inertia: products alone may all be near 0
     scale = max(scale, 1e-6 * first.or_("inertia_xx", 0.0)) if quantities[0] == "inertia_xy" else scale
     return all(abs(a - b) <= max(HELD * scale, floor) for a, b in pairs)
 
 
 def known_formats() -> dict[str, str]:
-    """Name -> words, of every format."""
+    """Name and description of every format."""
     return {n: f.words for n, f in FORMATS.items() if n != ROTORPY_JSON.name}
 
 

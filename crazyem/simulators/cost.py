@@ -1,7 +1,7 @@
-"""What it costs a simulator not to hold something: how far apart two models fly from the same states in half a second.
+"""The cost of an omission: distance between two models after half a second of flight from the same states.
 
-Without a recording the reference flight is made: a hundred starts of brisk flight (up to 1.5 m/s, 15 degrees, 1 rad/s)
-with rotor commands around hover. With a recording the costs are those of its own states and inputs.
+Without a recording the reference flight is synthetic: a hundred starts of brisk flight (up to 1.5 m/s, 15 degrees,
+1 rad/s) with rotor commands around hover. With a recording, states and inputs come from the recording.
 """
 
 import math
@@ -24,9 +24,9 @@ from crazyem.vehicle import GRAVITY, Vehicle
 Array = NDArray[np.float64]
 HORIZON = 0.5  # s
 STARTS, SPACING, STEP = 100, 0.1, 0.01  # starts; s from one to the next; s between commands
-SPEED, TILT, RATE = 1.5, math.radians(15.0), 1.0  # m/s, rad, rad/s: the most of the made flight
-STIR = 0.04  # of hover thrust: how far commands to each rotor swing about it
-NOTHING = 1e-9  # a distance that is arithmetic
+SPEED, TILT, RATE = 1.5, math.radians(15.0), 1.0  # m/s, rad, rad/s: largest values of the synthetic flight
+STIR = 0.04  # amplitude of the rotor commands around hover, relative to hover thrust
+NOTHING = 1e-9  # smaller distances are rounding errors and shown as 0
 _COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 
 
@@ -40,10 +40,10 @@ class Reference:
 
 
 def reference_flight(vehicle: Vehicle) -> Reference:
-    """The made flight of a vehicle: commands of thrust around its hover."""
+    """The synthetic flight of a vehicle: thrust commands around hover."""
     count = round((STARTS * SPACING + 2.0 * HORIZON) / STEP)
     time = np.arange(count) * STEP
-    # incommensurable frequencies [Hz], so that no start is like another
+    # incommensurable frequencies [Hz], so that all starts differ
     waves = [np.sin(2.0 * np.pi * (f * time + k / 4.0)) for k, f in enumerate((0.83, 1.31, 1.97, 2.71))]
     stir = np.stack(waves, axis=1)
     thrust = vehicle.mass * GRAVITY / 4.0 * (1.0 + STIR * stir)
@@ -61,7 +61,7 @@ def reference_flight(vehicle: Vehicle) -> Reference:
 
 
 def flown(reference: Reference, vehicle: Vehicle) -> Array:
-    """(n, k, 13) where a vehicle goes from every start."""
+    """(n, k, 13) predicted states of a vehicle from every start."""
     return Simulator(reference.inputs, vehicle=vehicle).run(reference.state, reference.times)
 
 

@@ -1,7 +1,7 @@
-"""What every format is: a table of fields, and how a file is read and written by it.
+"""Formats as tables of fields, and how to read and write a file by such a table.
 
-A field says where a number stands, which quantity it is, and in which unit. All else follows: the first field of a
-quantity gives it, further ones must agree, all of them are written.
+A field holds the place, the quantity and the unit of a number. Reading takes a quantity from its first field; further
+fields of the same quantity must agree. Writing fills all fields.
 """
 
 import math
@@ -15,8 +15,8 @@ from crazyem.simulators.constants import NUMBERS, SHORTEST_LAG, Constants, solve
 from crazyem.simulators.documents.spliced import Path, said
 from crazyem.simulators.plausible import impossible, objection
 
-AGREE = 0.01  # relative difference up to which two fields say the same
-SAME = 1e-9  # relative difference up to which a number in a template stays as it is written
+AGREE = 0.01  # relative difference up to which two fields agree
+SAME = 1e-9  # relative difference up to which a number in a template stays unchanged
 
 
 class Document(Protocol):
@@ -35,13 +35,13 @@ class Field:
     """A number in a file: `factor` times a quantity plus `offset`.
 
     Attributes:
-        path: where it stands.
+        path: of the number in the file.
         quantity: of `Constants`, or one that follows from them (`constants.DERIVED`).
         unit: of the number in the file.
-        magnitude: the sign is the file's own: it says on which side a rotor is, or which way it turns.
-        checked: whether it must agree with what other fields say.
-        given: whether the quantity may be taken from here.
-        own: read and written by the format's own functions; here it is for names and units alone.
+        magnitude: only the absolute value is the quantity; the sign gives the side or spin direction of a rotor.
+        checked: whether the number must agree with other fields.
+        given: whether reading may take the quantity from this field.
+        own: the format's own functions read and write this number; the field gives only its name and unit.
     """
 
     path: Path
@@ -60,11 +60,11 @@ class Field:
         return said(self.path)
 
     def read(self, number: float) -> float:
-        """The quantity that a number in the file says."""
+        """The quantity for a number in the file."""
         return ((abs(number) if self.magnitude else number) - self.offset) / self.factor
 
     def written(self, value: float, now: float | None) -> float:
-        """The number that says a quantity; `now` is what stands there."""
+        """The number in the file for a quantity; `now` is the present number."""
         number = value * self.factor + self.offset
         return -number if self.magnitude and now is not None and now < 0.0 else number
 
@@ -97,13 +97,13 @@ class SimulatorFile:
     """A file that was read.
 
     Attributes:
-        format: by name.
-        where: the file.
-        name: of the drone in it, "" where the file has one only.
-        constants: what it says.
-        fields: its fields, as found.
+        format: name of the format.
+        where: name of the file.
+        name: of the drone in the file, "" if the format holds one drone only.
+        constants: of the drone.
+        fields: of the file.
         contradictions: between its fields.
-        remarks: what else is to be known of it, a sentence each.
+        remarks: further notes on the file, a sentence each.
     """
 
     format: str
@@ -120,7 +120,7 @@ class SimulatorFile:
 
 
 def label_of(fields: Sequence[Field], quantity: str) -> str:
-    """The first field of a quantity, else the one that gives it by way of another quantity, else its own name."""
+    """Label of the first field of a quantity, else of a field from which the quantity follows, else its own name."""
     names = [quantity, *(d for d in _GIVERS.get(quantity, ()))]
     found = next((f for n in names for f in fields if f.quantity == n), None)
     return quantity if found is None else f"{found.label} [{found.unit}]"
@@ -135,11 +135,11 @@ _GIVERS = {
 
 
 def template(file: str, *, named: Callable[[str], str] = str) -> Callable[[str], str]:
-    """A format's `skeleton` out of the folder templates: the file, with the drone's name for each @NAME@.
+    """A `skeleton` function for a format: a file of the folder templates with the drone's name for each @NAME@.
 
     Args:
-        file: its name.
-        named: how the format writes a name.
+        file: name of the template.
+        named: converts the drone's name to the format's spelling.
     """
 
     def skeleton(name: str) -> str:
@@ -154,19 +154,19 @@ class Format:
     """A simulator's kind of file.
 
     Attributes:
-        name: as the command line has it.
+        name: on the command line.
         suffix: of its files.
-        words: what it is, for people.
-        open: from a text and its name to a document.
-        recognises: whether a text is of this kind.
+        words: description for people.
+        open: text and file name -> document.
+        recognises: whether a text has this format.
         fields: the table: document and name of the drone -> fields.
-        skeleton: name of the drone -> a file of it, where the user has no template.
+        skeleton: name of the drone -> text of a new file, used without a template.
         source: where the fields are documented.
-        names: the drones in a document; empty where it is of one.
-        read_more: document, drone and the quantities found until then -> remarks; adds to these what is no multiple of
-            one number (masses of propellers, laws that are no parabola).
+        names: document -> names of its drones; empty if the format holds one drone only.
+        read_more: document, drone and quantities found so far -> remarks. Adds the quantities that need more than one
+            number of the file (masses of propellers, laws that are no parabola).
         write_more: the same for writing; called last.
-        order: formats are listed, and a text is compared with them, in this order (then by name).
+        order: formats are listed and tried on a text in this order (then by name).
     """
 
     name: str
@@ -184,11 +184,11 @@ class Format:
 
 
 def read(form: Format, text: str, *, where: str, name: str | None = None, strict: bool = True) -> SimulatorFile:
-    """The constants that a file says.
+    """Read the constants of a file.
 
     Args:
-        name: of the drone, where the file has several.
-        strict: contradictory fields and an inertia that no body has are errors.
+        name: of the drone, if the file has several.
+        strict: contradictory fields and physically impossible inertias are errors.
 
     Raises: FileFormatError that names the field; UsageError for an unknown drone.
     """
@@ -254,7 +254,7 @@ _FOLLOWS = {
 
 
 def write(form: Format, constants: Constants, *, template: str | None = None, where: str = "", name: str = "") -> str:
-    """The text of a file with these constants; all else is the template's.
+    """The text of a file with these constants; all else comes from the template.
 
     Raises: UsageError where the constants lack what every file of this format needs, or for an unknown drone.
     """
@@ -274,17 +274,17 @@ def write(form: Format, constants: Constants, *, template: str | None = None, wh
             continue
         number = f.written(value, now)
         if now is None and number == 0.0:
-            continue  # what is not said is nothing
+            continue  # a missing number means 0
         if now is None or abs(number - now) > SAME * max(abs(number), abs(now)):
             document.put(f.path, number)
     if before is not None and math.isclose(before.or_("lag", -1.0), constants.or_("lag", -2.0), rel_tol=SAME):
-        constants = replace(constants, lag=None)  # as it stands there, whatever other numbers it depends on
+        constants = replace(constants, lag=None)  # an unchanged lag stays as the template has it
     form.write_more(document, drone, constants)
     return str(document.text)
 
 
 def _said_before(form: Format, text: str, where: str, drone: str) -> Constants | None:
-    """What a template says; None where it says nothing that can be used."""
+    """The constants of a template; None if they cannot be read."""
     try:
         return read(form, text, where=where, name=drone or None, strict=False).constants
     except FileFormatError:
@@ -292,14 +292,14 @@ def _said_before(form: Format, text: str, where: str, drone: str) -> Constants |
 
 
 def _stays(f: Field, now: float, value: float, before: Constants | None) -> bool:
-    """Whether a number in a template still says, as well as it did, what it said: its quantity did not change."""
+    """Whether a number in a template can stay: its quantity is unchanged and, for a checked field, it still agrees."""
     if before is None or not math.isclose(value_of(before, f.quantity), value, rel_tol=SAME):
         return False
     return not f.checked or math.isclose(f.read(now), value, rel_tol=AGREE)
 
 
 def drone_of(form: Format, document: Any, name: str | None) -> str:
-    """Which drone of a file is meant. Raises UsageError where that is not clear."""
+    """Name of the requested drone in a file. Raises UsageError if unknown or ambiguous."""
     names = form.names(document)
     if not names:
         return ""

@@ -1,5 +1,6 @@
-"""What flights say of a simulator's file, in its own names and units: each field, the pairs that no flight tells apart,
-and how far a file may be off before it no longer fits."""
+"""Compare a simulator's file with flights, in the names and units of the file.
+
+A finding for each field; mass and thrust as alternatives, because flights identify only their ratio."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -12,7 +13,7 @@ from crazyem.simulators.fields import Field, SimulatorFile
 from crazyem.vehicle import Vehicle
 
 SURE = 1.96  # standard deviations of a 95 % interval
-TOLERANCE = 0.05  # relative, of a number in a file: less is no reason to change it
+TOLERANCE = 0.05  # relative deviation of a number in a file up to which the number may stay
 GAUGE = (
     "flights tell thrust over mass and torque over inertia, not each alone: mass, inertia, thrust and drag may all be "
     "larger by one factor; weigh the drone and say --mass"
@@ -22,14 +23,14 @@ HEAVY = ("N", "kg")  # units that have a mass in them
 
 @dataclass(frozen=True)
 class FieldFinding:
-    """A field of a file, and what flights say of it.
+    """A field of a file, with its value in the file and by the flights.
 
     Attributes:
-        field, unit: as the file has them. quantity: in SI words.
-        value: in the file; NaN where it is not said.
-        fitted, sd: by the flights, in the file's unit; sd is NaN where flights say nothing.
+        field, unit: as in the file. quantity: its name in `Constants`.
+        value: in the file; NaN if missing.
+        fitted, sd: estimate from the flights, in the file's unit; sd is NaN if flights give no information.
         off: whether the file's value lies outside the 95 % interval, and by more than `tolerance`.
-        why: what there is to know, "" if nothing.
+        why: a note for people, "" if none.
     """
 
     field: str
@@ -43,12 +44,12 @@ class FieldFinding:
 
     @property
     def known(self) -> bool:
-        """Whether flights say anything of it."""
+        """Whether flights give information on this field."""
         return math.isfinite(self.sd)
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 %."""
+        """95 % interval."""
         return self.fitted - SURE * self.sd, self.fitted + SURE * self.sd
 
     def __str__(self) -> str:
@@ -82,13 +83,14 @@ def field_findings(
     looked_for: Collection[str] | None = None,
     tolerance: float = TOLERANCE,
 ) -> list[FieldFinding]:
-    """Every quantity of a file once, with what flights say.
+    """A finding for every quantity of a file, each quantity once.
 
     Args:
-        before: the vehicle of the file. fitted: with what was found.
+        before: the vehicle of the file. fitted: the vehicle with the diagnosed effects.
         effects: of the diagnosis' document: name, and parameters with value and sd.
-        not_identifiable: effect -> why flights say nothing of it.
-        looked_for: effects that were tried; None: all.
+        not_identifiable: effect -> why flights give no information on it.
+        looked_for: effects that the diagnosis tried; None: all.
+        tolerance: relative deviation up to which a number is not off.
     """
     old, new = from_vehicle(before)[0], from_vehicle(fitted)[0]
     moved = _moved(fitted, effects)
@@ -111,7 +113,7 @@ def field_findings(
 
 
 def _once(fields: Sequence[Field]) -> list[Field]:
-    """The first field of each quantity; of two quantities that are one (m g and m) the one that gives it."""
+    """The first field of each quantity, among fields that are checked and give their quantity."""
     seen: dict[str, Field] = {}
     for f in fields:
         if f.checked and f.given:
@@ -120,7 +122,7 @@ def _once(fields: Sequence[Field]) -> list[Field]:
 
 
 def _moved(fitted: Vehicle, effects: Sequence[Mapping[str, Any]]) -> list[Constants]:
-    """The fitted constants with each parameter that was found one standard deviation further."""
+    """The fitted constants, once for each fitted parameter, with this parameter raised by one standard deviation."""
     found = []
     for effect in effects:
         present = fitted.effects.get(effect["name"])
@@ -142,7 +144,7 @@ def _reason(quantity: str, not_identifiable: Mapping[str, str], looked_for: Coll
 
 
 def _about(quantity: str) -> list[str]:
-    """Effects without which a quantity looks wrong, the nearest first."""
+    """Effects whose absence makes a quantity look wrong, the closest first."""
     found = [(e.about.index(quantity), e.name) for e in CATALOGUE.values() if quantity in e.about]
     return [name for _, name in sorted(found)]
 
@@ -151,7 +153,7 @@ def rescaled(vehicle: Vehicle, mass: float) -> Vehicle:
     """The same motion with another mass: every force, torque and inertia changes by the same factor.
 
     Args:
-        mass: of the whole drone, as it was weighed [kg].
+        mass: weighed mass of the whole drone [kg].
     """
     factor = mass / from_vehicle(vehicle)[0].or_("mass", vehicle.mass)
     units = {(e.name, p.name): p.unit for e in CATALOGUE.values() for p in e.parameters}
@@ -179,7 +181,7 @@ def rescaled(vehicle: Vehicle, mass: float) -> Vehicle:
 
 
 def alternatives(imported: SimulatorFile, fitted: Vehicle, mass: float) -> list[dict[str, Any]]:
-    """The fitted constants of a file with its own mass, and with the mass that leaves its thrust as it is."""
+    """The fitted constants of a file, once with the given mass and once with the mass that keeps the file's thrust."""
     old, new = imported.constants, from_vehicle(fitted)[0]
     if old.thrust_per_speed2 is None or new.thrust_per_speed2 is None or new.mass is None:
         return []

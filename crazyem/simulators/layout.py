@@ -1,4 +1,4 @@
-"""Where four rotors are: positions from the centre of mass, as some files have them, to arms and centre, and back."""
+"""Convert rotor positions relative to the centre of mass, as in some files, to arms and centre of mass, and back."""
 
 import math
 
@@ -10,7 +10,7 @@ from crazyem.simulators.constants import Constants
 
 Array = NDArray[np.float64]
 EQUAL = 1e-3  # relative difference of arms up to which four rotors are the corners of a rectangle
-NOTHING = 1e-10  # of the largest arm or moment of inertia of a drone: a rest of arithmetic
+NOTHING = 1e-10  # relative to the largest arm or moment of inertia of a drone: smaller values are rounding errors
 PLUS = "the rotors lie on the body axes (a plus); it is read as the same drone turned by 45 degrees"
 
 
@@ -32,13 +32,13 @@ def read_positions(positions: Array, *, where: str, field: str) -> tuple[dict[st
     if len(quadrants) != 4 or not np.allclose(arms, arm, rtol=EQUAL, atol=0.0):
         raise FileFormatError(f"{where}: {field}: the four rotors are not the corners of a rectangle")
     found = {"arm_x": float(arm[0]), "arm_y": float(arm[1])}
-    # positions that are round numbers leave a rest of arithmetic in their mean
+    # the mean of positions has a rounding error even if the centre of mass is in the middle
     centre = np.where(np.abs(middle) < NOTHING * arm.max(), 0.0, -middle)
     return found | {f"centre_{a}": float(c) for a, c in zip("xyz", centre)}, remarks
 
 
 def placed(now: Array, c: Constants) -> Array:
-    """Rotor positions (4, 3) with these arms and centre, each on its own side."""
+    """Rotor positions (4, 3) [m] with these arms and centre; each rotor keeps its side in `now`."""
     around = now - now.mean(axis=0)
     arm = np.array([c.or_("arm_x", math.nan), c.or_("arm_y", math.nan)])
     if is_plus(now):

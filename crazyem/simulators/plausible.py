@@ -1,4 +1,4 @@
-"""Constants that no drone has: impossible inertias, and units that a file got wrong as far as numbers can show it."""
+"""Checks for constants that no drone has: impossible inertias, and numbers that suggest a wrong unit in a file."""
 
 import math
 from collections.abc import Callable
@@ -7,19 +7,19 @@ import numpy as np
 
 from crazyem.simulators.constants import Constants, hover_speed, inertia_of
 
-# Speed of a point at the arm's length from a rotor's axis, at hover [m/s]: 56 of a 0.5 kg hummingbird, 65 of a
-# Crazyflie, 130 of a 2 kg X500. A speed in RPM instead of rad/s is off by 9.5 times, and so leaves this range.
+# Speed at hover of a point at the arm's length from a rotor's axis [m/s]: 56 for a 0.5 kg hummingbird, 65 for a
+# Crazyflie, 130 for a 2 kg X500. Rotor speeds in RPM instead of rad/s differ by a factor of 9.5 and leave this range.
 TIP_SPEED = (15.0, 250.0)
 RPM = 60.0 / (2.0 * math.pi)  # rev/min of one rad/s
-# Inertia about x over mass times squared arm: 0.5 of a Crazyflie; 2 of four masses at the rotors.
+# Inertia about x over mass times squared arm: 0.5 for a Crazyflie; 2 for four masses at the rotors.
 SPREAD_OF_MASS = (0.02, 20.0)
 
 
 def objection(c: Constants, label: Callable[[str], str]) -> str:
-    """Why these are no constants of a drone, one clause that names the field; "" where they may be.
+    """Why no drone can have these constants: one clause that names the field; "" if a drone can.
 
     Args:
-        label: a quantity as the file calls it.
+        label: quantity -> its name in the file.
     """
     if c.mass is None:
         return f"{label('mass')} is missing"
@@ -52,7 +52,7 @@ def _inertia(c: Constants, label: Callable[[str], str]) -> str:
 
 
 def impossible(c: Constants, label: Callable[[str], str]) -> str:
-    """That no body has this inertia, by the triangle inequality of its moments, one clause; "" where one may."""
+    """A clause if the moments of inertia violate the triangle inequality, so that no body has them; else ""."""
     matrix = inertia_of(c)
     if matrix is None:
         return ""

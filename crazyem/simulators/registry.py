@@ -1,4 +1,4 @@
-"""All formats by name, and which of them a text is: a module of `formats/` that makes a `Format` is in it."""
+"""All formats by name, and recognition of a text's format. Every `Format` in a module of `formats/` is registered."""
 
 import importlib
 import pkgutil
@@ -12,11 +12,11 @@ OWN = "crazyem"  # a vehicle file
 
 
 def discover(paths: Iterable[str], package: str = "") -> dict[str, Format]:
-    """Every format that the modules of some folders make, by `order` and name.
+    """Every `Format` in the modules of some folders, sorted by `order` and name.
 
     Args:
         paths: folders.
-        package: dotted name of the package that they are; empty: top level.
+        package: dotted name of the package of these folders; empty: top level.
     """
     modules = pkgutil.iter_modules(list(paths), f"{package}." if package else "")
     found = [v for m in modules for v in vars(importlib.import_module(m.name)).values() if isinstance(v, Format)]
@@ -36,9 +36,9 @@ def format_named(name: str) -> Format:
 
 
 def format_of(text: str, *, where: str) -> str:
-    """The name of the format that a text is of, `OWN` for a vehicle file.
+    """The name of a text's format, `OWN` for a vehicle file.
 
-    Raises: FileFormatError where it is of none.
+    Raises: FileFormatError if no format fits.
     """
     for form in FORMATS.values():
         if form.recognises(text):

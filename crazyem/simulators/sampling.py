@@ -1,7 +1,7 @@
-"""Drones as they may be, by the joint posterior of a fitted vehicle: for domain randomisation and for ensembles.
+"""Draw vehicles from the joint posterior of a fitted vehicle, for domain randomisation and for ensembles.
 
-What flights know stays together (thrust over mass, torque over inertia), what they do not know is spread (the mass
-alone). From one day to the next a drone differs by more than a fit is unsure of: thrust, trim, the lag of its rotors.
+Flights identify ratios (thrust over mass, torque over inertia), but not the mass; the mass is drawn separately. From
+day to day, thrust, trim and rotor lag of a drone vary by more than the posterior says, so their variation is added.
 """
 
 import math
@@ -23,9 +23,9 @@ from crazyem.simulators.plausible import impossible
 from crazyem.vehicle import Posterior, Vehicle
 
 Array = NDArray[np.float64]
-MASS_SD = 0.02  # relative: a battery, a deck or markers more or less that nobody weighed
-USUAL_LAG = 0.05  # s, of the file for which `DAILY_LAG_SD` was found; a lag is positive, so it spreads by a factor
-TRIES = 200  # draws of one drone until it is one that can be
+MASS_SD = 0.02  # relative: other batteries, decks or markers that were not weighed
+USUAL_LAG = 0.05  # s, nominal lag for which `DAILY_LAG_SD` was found; their ratio is the sd of the lag's logarithm
+TRIES = 200  # most draws until a drone is physically possible
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +33,8 @@ class VehicleSample:
     """Drones that were drawn.
 
     Attributes:
-        vehicles: each.
-        parameters: of the posterior. draws: (n, k) of them. seed: of the draws.
+        vehicles: one per draw.
+        parameters: k names, as in the posterior. draws: (n, k) their values. seed: of the draws.
     """
 
     vehicles: tuple[Vehicle, ...]
@@ -43,7 +43,7 @@ class VehicleSample:
     seed: int
 
     def arrays(self) -> dict[str, Array]:
-        """Constants in SI, (n,) each by their names in `Constants`, and parameters of effects that are in none."""
+        """Constants by their names in `Constants`, (n,) each, and parameters of effects that no constant expresses."""
         rows = [from_vehicle(v)[0] for v in self.vehicles]
         found = {n: np.array([r.or_(n, math.nan) for r in rows]) for n in NUMBERS}
         found = {n: v for n, v in found.items() if np.isfinite(v).all()}
@@ -61,13 +61,12 @@ def sample(
     """Draw drones from the posterior of a fitted vehicle.
 
     Args:
-        count: how many.
+        count: number of drones.
         seed: the same seed gives the same drones.
-        days: other days than those of the flights: thrust, trim and lag differ as they do from day to day.
-        mass_sd: relative standard deviation of the mass, with which inertia, thrust and drag go; 0 where it was
-            weighed.
+        days: whether to add the day-to-day variation of thrust, trim and lag.
+        mass_sd: relative standard deviation of the mass; inertia, thrust and drag scale with it. 0 for a weighed drone.
 
-    Raises: UsageError: the vehicle has no posterior. DataError: hardly any drone of its posterior can be.
+    Raises: UsageError: the vehicle has no posterior. DataError: hardly any draw is physically possible.
     """
     posterior = vehicle.posterior
     if posterior is None:
@@ -121,7 +120,7 @@ def _drawn(vehicle: Vehicle, parameters: Sequence[str], theta: Array) -> Vehicle
 
 
 def _another_day(vehicle: Vehicle, rng: np.random.Generator) -> Vehicle:
-    """The same drone on another day; the spreads stand with the effects."""
+    """The same drone with the thrust, trim and lag of another day."""
     effects = {n: dict(v) for n, v in vehicle.effects.items()}
     thrust_sd, *trim_sd = day_sd(vehicle)
     scale = effects.setdefault(THRUST_SCALE.name, {"scale": 1.0})

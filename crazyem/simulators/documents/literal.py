@@ -1,7 +1,7 @@
-"""Python dicts and JSON with places: read from the syntax tree, never executed.
+"""Python dicts and JSON as editable documents: read from the syntax tree, never executed.
 
-Known are numbers, texts, dicts, lists, sums and products of them, names that were assigned such a value before, and
-`np.array`, `np.sqrt`, `np.pi`. JSON is read by the same parser: its numbers and texts are Python's.
+Supported are numbers, texts, dicts, lists, sums and products of them, names with such a value assigned earlier, and
+`np.array`, `np.sqrt`, `np.pi`. The same parser reads JSON, whose numbers and texts are valid Python.
 """
 
 import ast
@@ -22,7 +22,7 @@ _LARGEST_POWER = 64.0
 
 
 class UnknownError(ValueError):
-    """An expression that is not read."""
+    """An expression that is not supported."""
 
 
 class LiteralDocument(Spliced):
@@ -71,7 +71,7 @@ class LiteralDocument(Spliced):
         return [str(k.value) for k in node.keys if isinstance(k, ast.Constant)]
 
     def value(self, path: Path) -> Any:
-        """What stands at a path as number, text, list or None; dicts and what is not read are None."""
+        """The number, text or list at a path; None for a dict or an unsupported expression."""
         node, rest = self._down(path)
         if node is None or isinstance(node, ast.Dict):
             return None
@@ -88,7 +88,7 @@ class LiteralDocument(Spliced):
         return as_number(self.value(path))
 
     def put(self, path: Path, value: float) -> bool:
-        """Let a number stand at a path; False if there is no such place. A missing key is added to its dict."""
+        """Write a number at a path; False if there is no such place. A missing key is added to its dict."""
         node, rest = self._down(path)
         if node is None or isinstance(node, ast.Dict):
             return node is not None and len(rest) == 1 and self._added(node, str(rest[0]), value)
@@ -119,7 +119,7 @@ class LiteralDocument(Spliced):
         return True
 
     def _down(self, path: Path) -> tuple[ast.expr | None, Path]:
-        """The deepest node of a path that has a place of its own, and the steps that are left."""
+        """The deepest node along a path, and the remaining steps."""
         node: ast.expr | None = self.root.get(path[0])
         for k, step in enumerate(path[1:], start=1):
             if isinstance(node, ast.Dict):
@@ -168,7 +168,7 @@ class LiteralDocument(Spliced):
 
 
 class Vector(list[Any]):
-    """A list of numbers that is added and multiplied number by number, as an array."""
+    """A list of numbers with element-wise addition and multiplication, as an array."""
 
 
 def _each(do: Callable[[Any, Any], Any], left: Any, right: Any) -> Any:

@@ -1,4 +1,4 @@
-"""A text, numbers that are found by a path, and edits that touch nothing else; and PX4's files of parameters as one.
+"""A text whose numbers are found by a path and edited in place, and PX4's parameter files as such a document.
 
 PX4 parameters are `param set-default NAME VALUE` of an airframe script, or a ground station's table of parameters.
 """
@@ -13,7 +13,7 @@ LARGEST = 10_000_000  # characters of a file of constants
 
 
 def number_text(value: float) -> str:
-    """A number as files have it: twelve digits, which is more than anybody measures, and no noise of arithmetic."""
+    """A number as text with twelve digits: more than any measurement has, and free of rounding errors."""
     return repr(float(f"{value:.12g}"))
 
 
@@ -28,7 +28,7 @@ def as_number(text: Any) -> float | None:
 
 
 class Spliced:
-    """A text with places of numbers, and what shall stand there.
+    """A text with pending edits by byte position.
 
     Attributes:
         where: the file, for errors.
@@ -42,11 +42,11 @@ class Spliced:
         self._edits: dict[tuple[int, int], bytes] = {}
 
     def _place(self, span: tuple[int, int], text: str) -> None:
-        """Let `text` stand where bytes start to end stand now; a span of no length inserts."""
+        """Replace the bytes from start to end by `text`; an empty span inserts."""
         self._edits[span] = text.encode()
 
     def _insert(self, at: int, text: str) -> None:
-        """Let `text` stand before byte `at`, after what was inserted there before."""
+        """Insert `text` before byte `at`, after earlier insertions at the same place."""
         self._place((at, at), self._edits.get((at, at), b"").decode() + text)
 
     @property
@@ -74,7 +74,7 @@ _LINE = re.compile(
 
 
 class SplicedText(Spliced):
-    """A text whose places are known in characters."""
+    """A text whose places are given in characters instead of bytes."""
 
     def __init__(self, text: str, where: str) -> None:
         super().__init__(text, where)
@@ -91,14 +91,14 @@ class SplicedText(Spliced):
 
 
 class ParamDocument(SplicedText):
-    """A file of parameters; a path is one name. Of a name that is set twice the last counts, as in a script."""
+    """A parameter file; a path is one name. If a name is set twice, the last value counts, as in a script."""
 
     def __init__(self, text: str, where: str) -> None:
         super().__init__(text, where)
         self._found = {m["name"]: m for m in _LINE.finditer(text)}
 
     def names(self) -> list[str]:
-        """Of all parameters."""
+        """Names of all parameters."""
         return list(self._found)
 
     def get(self, path: Path) -> float | None:

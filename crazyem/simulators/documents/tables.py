@@ -34,7 +34,7 @@ class TomlDocument:
         return as_number(self._at(path))
 
     def put(self, path: Path, value: float) -> bool:
-        """Let a number stand at a path; False if there is no such place. A missing key is added to its table."""
+        """Write a number at a path; False if there is no such place. A missing key is added to its table."""
         holder = self._at(path[:-1])
         if holder is None or isinstance(holder, int | float | str):
             return False
@@ -71,7 +71,7 @@ class YamlDocument(SplicedText):
         return [str(k.value) for k, _ in node.value] if node is not None and _is_mapping(node) else []
 
     def length(self, path: Path) -> int:
-        """How many entries the list at a path has."""
+        """Number of entries of the list at a path."""
         node = self._node(path)
         return len(node.value) if node is not None and _is_list(node) else 0
 
@@ -81,7 +81,7 @@ class YamlDocument(SplicedText):
         return None if node is None or not isinstance(node.value, str) else as_number(node.value)
 
     def put(self, path: Path, value: float) -> bool:
-        """Let a number stand at a path; False if there is no such place. A missing key is added to its mapping."""
+        """Write a number at a path; False if there is no such place. A missing key is added to its mapping."""
         node = self._node(path)
         if node is None:
             return self._added(path, value)

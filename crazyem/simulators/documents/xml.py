@@ -1,4 +1,4 @@
-"""XML with places: URDF, MJCF and SDF. A path is steps of elements, then "@attribute" or "#", then maybe an index.
+"""XML as editable document: URDF, MJCF, SDF. A path is element steps, then "@attribute" or "#", then maybe an index.
 
 An element step is `tag`, `tag[2]` (the third of that tag) or `tag[name=x]`. "#" is the text of an element. An index
 chooses one of several numbers in a text: `("link[name=base_link]", "inertial", "origin", "@xyz", 0)`.
@@ -99,7 +99,7 @@ class XmlDocument(Spliced):
         return self._data[element.inside : element.end].decode()
 
     def words(self, path: Path) -> tuple[list[str], int, int] | None:
-        """The words of an attribute or text, and where it is."""
+        """The words of an attribute or text, and its start and end."""
         index = next(k for k, step in enumerate(path) if str(step)[0] in "@#")
         element = self.find(path[:index])
         if element is None:
@@ -117,7 +117,7 @@ class XmlDocument(Spliced):
         return None if found is None or at >= len(found[0]) else as_number(found[0][at])
 
     def put(self, path: Path, value: float) -> bool:
-        """Let a number stand at a path; False if there is no such place."""
+        """Write a number at a path; False if there is no such place."""
         found = self.words(path)
         at = path[-1] if isinstance(path[-1], int) else 0
         if found is None:
@@ -131,7 +131,7 @@ class XmlDocument(Spliced):
         return True
 
     def put_vector(self, path: Path, values: Sequence[float]) -> bool:
-        """Let numbers stand in a text, which is added if there is none."""
+        """Write numbers into an attribute or text; a missing one is added."""
         found, text = self.words(path), " ".join(map(number_text, values))
         if found is None:
             return self._added(path, text)
@@ -139,7 +139,7 @@ class XmlDocument(Spliced):
         return True
 
     def _added(self, path: Path, text: str) -> bool:
-        """A missing leaf `<tag>value</tag>` as the last child of its parent."""
+        """Add a missing leaf `<tag>value</tag>` as the last child of its parent."""
         if path[-1] != "#" or len(path) < 2:
             return False
         parent = self.find(path[:-2])

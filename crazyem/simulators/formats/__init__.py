@@ -1,1 +1,1 @@
-"""One file a format: its table of fields, how it is told by content, and a file for those who have none."""
+"""One module per format: its table of fields, its recognition by content, and a file for users without a template."""

@@ -1,7 +1,7 @@
 """crazyflow: a table per drone in `dynamics/first_principles/params.toml`.
 
-Thrust and torque are polynomials in RPM, and rotors follow with two rates, for rising and falling. Constants are those
-at hover; in a template these polynomials and rates keep their shape and are scaled as a whole.
+Thrust and torque are polynomials in RPM. Rotors have two rates, for rising and falling speed. The constants are values
+at hover; in a template the polynomials and rates are scaled as a whole and keep their shape.
 """
 
 import math
@@ -16,7 +16,7 @@ from crazyem.vehicle import GRAVITY
 
 _AXES = "xyz"
 PER_RPM2 = 1.0 / RPM**2  # N/RPM^2 of one N/(rad/s)^2
-BENT = 1e-6  # share of hover thrust from which a polynomial is no parabola
+BENT = 1e-6  # share of constant and linear terms in hover thrust above which a polynomial is no parabola
 
 
 def _fields(document: Any, name: str) -> list[Field]:
@@ -39,7 +39,7 @@ def _numbers(document: TomlDocument, name: str, key: str, count: int) -> list[fl
 
 
 def speed_of(law: Sequence[float], thrust: float) -> float:
-    """RPM at which a polynomial gives a thrust [N]; NaN where it never does."""
+    """Speed [RPM] at which a polynomial gives a thrust [N]; NaN if there is none."""
     a, b, c = law[0] - thrust, law[1], law[2]
     root = b * b - 4.0 * a * c
     return (-b + math.sqrt(root)) / (2.0 * c) if c > 0.0 and root >= 0.0 else math.nan
@@ -97,7 +97,7 @@ def _write_more(document: TomlDocument, name: str, c: Constants) -> None:
 
 
 def _scale(document: TomlDocument, name: str, key: str, wanted: float, rpm: float) -> None:
-    """Scale a polynomial so that it has a value at a speed."""
+    """Scale a polynomial so that it has the wanted value at a speed."""
     law = _numbers(document, name, key, 3)
     now = law[0] + law[1] * rpm + law[2] * rpm**2 if law else 0.0
     if now <= 0.0:

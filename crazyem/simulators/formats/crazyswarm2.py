@@ -1,6 +1,6 @@
-"""crazyswarm2: `robots.NAME.firmware_params` of config/crazyflies.yaml, what the controllers on board believe.
+"""crazyswarm2: `robots.NAME.firmware_params` of config/crazyflies.yaml, the constants of the controllers on board.
 
-Its own simulator takes no constants from here.
+Crazyswarm2's own simulator does not read them.
 """
 
 from crazyem.simulators.documents.tables import YamlDocument

@@ -1,7 +1,7 @@
 """Gazebo: an SDF model with a MulticopterMotorModel plugin for each rotor, and the same constants in its controller.
 
-Propellers are bodies of their own here. Mass, centre and inertia of a drone are those of the body and its propellers
-together, without their inertia about the axes that they turn on; in a template the body takes what they leave.
+Propellers are separate bodies here. Mass, centre and inertia of a drone are those of body and propellers together,
+without the propellers' inertia about their rotation axes. In a template the propellers stay and the body changes.
 """
 
 from dataclasses import dataclass
@@ -63,7 +63,7 @@ class _Parts:
 
     @property
     def rounding(self) -> float:
-        """A distance [m] that is a rest of arithmetic with numbers of twelve digits."""
+        """Largest distance [m] that counts as a rounding error."""
         return NOTHING * float(np.abs(self.places - self.middle).max())
 
 
@@ -99,7 +99,7 @@ def _parts(document: XmlDocument) -> _Parts:
 
 
 def _number(link: Element, document: XmlDocument, *path: str) -> float:
-    """A number of the inertial of a link; 0 where it is not said."""
+    """A number of a link's <inertial> element; 0 if missing."""
     elements = [link]
     for tag in ("inertial", *path[:-1]):
         elements = elements[0].all(tag) if elements else []
@@ -169,7 +169,7 @@ def _read_more(document: XmlDocument, name: str, found: dict[str, float]) -> lis
     return [f"{said} {1e3 * up:.3g} and {1e3 * down:.3g} ms; {one}"]
 
 
-_DEFAULT_LAGS = (1.0 / 80.0, 1.0 / 40.0)  # s, of the plugin where the file does not say
+_DEFAULT_LAGS = (1.0 / 80.0, 1.0 / 40.0)  # s, defaults of the plugin
 
 
 def _lags(document: XmlDocument) -> tuple[float, float] | None:
@@ -182,7 +182,7 @@ def _lags(document: XmlDocument) -> tuple[float, float] | None:
 
 
 def _around(parts: _Parts, centre: Array, mass: float, place: Array) -> Array:
-    """What body and propellers add to the body's own inertia about a common centre."""
+    """Inertia of the masses of body and propellers about a common centre, to add to the body's own inertia."""
     found = parts.own + steiner(mass, place - centre)
     for m, r in zip(parts.masses, parts.places):
         found = found + steiner(float(m), r - centre)
@@ -191,7 +191,7 @@ def _around(parts: _Parts, centre: Array, mass: float, place: Array) -> Array:
 
 def _write_more(document: XmlDocument, name: str, c: Constants) -> None:
     path, model = _model(document)
-    before, parts = _parts(document), _parts(XmlDocument(document.text, document.where))  # with the arms that were put
+    before, parts = _parts(document), _parts(XmlDocument(document.text, document.where))  # with the new arms
     matrix = inertia_of(c)
     if c.mass is None or matrix is None:
         return

@@ -1,7 +1,7 @@
 """gym-pybullet-drones: a URDF with `<properties>`. kf and km are per RPM squared; rotors have no lag.
 
-Drag acts in the physics modes that have it (`pyb_drag` and its kin), by rotor speed; it is written for hover. Products
-of inertia are not written: Bullet turns the base frame to the principal axes, and the attitude would be off by that.
+Drag acts only in physics modes such as `pyb_drag`. Its coefficient is per rotor speed and written for hover speed.
+Products of inertia are not written: Bullet would turn the base frame to the principal axes and change the attitude.
 """
 
 from typing import Any

@@ -1,7 +1,7 @@
 """l2f (RAPTOR): the JSON of `parameters_to_json`. Thrust is a polynomial in a normalised command; J_inv follows J.
 
-Rotor positions are from the centre of mass. Rotors rise and fall with time constants of their own; in a template their
-ratio stays.
+Rotor positions are from the centre of mass. Rotors have separate time constants for rising and falling; in a template
+their ratio stays.
 """
 
 import math
@@ -16,7 +16,7 @@ from crazyem.simulators.fields import AGREE, Field, Format, template
 from crazyem.simulators.layout import placed, read_positions
 from crazyem.vehicle import GRAVITY
 
-ROUNDED = 1e-4  # relative difference up to which a number that follows from others is as it was printed
+ROUNDED = 1e-4  # relative difference up to which a derived number counts as unchanged: files hold rounded numbers
 _AXES = "xyz"
 _LAGS = ("rotor_time_constants_rising", "rotor_time_constants_falling")
 
@@ -61,7 +61,7 @@ def _limits(document: LiteralDocument) -> tuple[float, float]:
 
 
 def _lags(document: LiteralDocument) -> list[float]:
-    """Mean time constants of rising and falling; empty where they are not said."""
+    """Mean rotor time constants of rising and of falling [s]; empty if missing."""
     found = []
     for key in _LAGS:
         values = [document.get((*_root(document), key, k)) for k in range(4)]

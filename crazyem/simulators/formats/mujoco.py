@@ -1,6 +1,6 @@
-"""MuJoCo: the free body of an MJCF. Thrust and torque are its inputs, or one motor a rotor at sites of the body.
+"""MuJoCo: the free body of an MJCF. Inputs are thrust and torque, or one motor per rotor at sites of the body.
 
-The menagerie's Crazyflie has one motor for the thrust and three for torques, those with a gear of -1.
+The menagerie's Crazyflie has one motor for the thrust and three motors with a gear of -1 for the torques.
 """
 
 import math
@@ -77,7 +77,7 @@ def _write_more(document: XmlDocument, name: str, constants: Any) -> None:
     limits = {"x": constants.arm_y, "y": constants.arm_x, "z": constants.torque_per_thrust}
     if constants.thrust_max is None or "crazyem" not in document.root.attributes.get("model", ("",))[0]:
         return
-    # of our own skeleton only: a template's limits of torque are a choice of its author
+    # only in our own skeleton: torque limits in a template are a choice of its author
     for k, axis in enumerate("xyz", start=1):
         arm = limits[axis]
         for side, sign in enumerate((-1.0, 1.0)):

@@ -1,6 +1,6 @@
 """OmniDrones: the YAML beside a drone's USD file. Constants are per (rad/s)^2.
 
-Its `drag_coef` is multiplied by zeros and so acts on nothing; it is neither read nor written.
+OmniDrones multiplies its `drag_coef` by zero, so it has no effect; it is neither read nor written.
 """
 
 import math

@@ -1,6 +1,6 @@
 """PX4 SIH: parameters of an airframe script or of a ground station. Body axes are FRD; thrust is linear in command.
 
-SIH has one drag and one damping for all axes. Of products of inertia Ixy and Ixz change their sign with the axes.
+SIH has one drag and one damping for all axes. The products of inertia Ixy and Ixz change sign between FLU and FRD.
 """
 
 from crazyem.simulators.documents.spliced import ParamDocument
@@ -24,7 +24,7 @@ def _fields(document: ParamDocument, name: str) -> list[Field]:
         Field(("SIH_KDV",), "drag", "N/(m/s)"),
         Field(("SIH_KDW",), "damping", "N m/(rad/s)"),
         Field(("SIH_T_TAU",), "lag", "s"),
-        # of the controller and its allocation: they follow where they are set
+        # parameters of the controller and its allocation change only where they are set
         *(f for f in (hover, *allocation) if document.get(f.path) is not None),
     ]
 

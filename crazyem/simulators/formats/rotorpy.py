@@ -1,7 +1,7 @@
 """rotorpy: the dict `quad_params` of a Python module, or the same as JSON. The module is read, never executed.
 
-Rotor positions are from the centre of mass. k_d and k_z are drags per rotor speed; they are written for hover. They act
-at the rotors, so they damp rotation as well: by drag times squared arm.
+Rotor positions are from the centre of mass. k_d and k_z are drag per rotor speed, written for hover speed. They act at
+the rotors and therefore also damp rotation, by drag times squared arm.
 """
 
 from typing import Any
