@@ -1,4 +1,4 @@
-"""Diagnosis and prediction: where a model and recordings part, and where a vehicle goes by its model."""
+"""Diagnosis of the differences between a model and recordings, and open-loop prediction with a model."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +35,7 @@ def predict(
     options: ReadOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Prediction:
-    """Predict `horizon` steps from every `every`-th recorded state, without any measurement after the start.
+    """Predict `horizon` steps from every `every`-th recorded state, open loop: no measurement after the start is used.
 
     Args:
         recording: a recording, or the path of one of any known format.
@@ -43,9 +43,9 @@ def predict(
         horizon: N, steps from each start.
         step: s between predicted states; None: the recorded samples.
         every: samples from one start to the next.
-        plain: the model alone, however wrong its turning was before a start.
+        plain: use the model alone, without correction by its errors of rotation before each start.
         options: how a path is read.
-        progress: told how many starts of how many are done.
+        progress: called with the number of finished starts and the number of all starts.
 
     Raises:
         UsageError: no such file or vehicle, or more predictions than fit into memory. FileFormatError: no recording.
@@ -70,11 +70,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis(by_recordings.Diagnosis):
-    """A diagnosis with its document: what was found, the fitted vehicle, and errors of prediction before and after.
+    """A diagnosis and its document: effects, the fitted vehicle, and prediction errors before and after the fit.
 
     Attributes:
         document: for programs; keys as in docs/reference/json.md.
-        pictures: what is accused and how predictions err, by name.
+        pictures: time series for the plots, by name.
     """
 
     document: Mapping[str, Any] = field(default_factory=dict, repr=False)
@@ -99,7 +99,7 @@ class Diagnosis(by_recordings.Diagnosis):
         return html_table(title, header, rows, self.document["notices"])
 
     def plot(self, path: str | Path | None = None) -> "Figure":
-        """What the model lacks over time, before and after; saved where `path` says.
+        """Plot the errors of the model over time, before and after the fit; saved to `path` if given.
 
         Raises:
             UsageError: the file cannot be written. MissingExtraError: no matplotlib.
@@ -113,7 +113,7 @@ class Diagnosis(by_recordings.Diagnosis):
         return saved(figure, path)
 
     def report(self, path: str | Path) -> None:
-        """One self-contained HTML page.
+        """Write the diagnosis as one self-contained HTML page.
 
         Raises:
             UsageError: the file cannot be written. MissingExtraError: no Jinja2, or no matplotlib.
@@ -123,7 +123,7 @@ class Diagnosis(by_recordings.Diagnosis):
         write_report(path, self.document, self.pictures)
 
     def named_vehicle(self, name: str) -> Vehicle:
-        """The fitted vehicle under a name of its own; `Vehicle.to_toml` gives the text of its file."""
+        """The fitted vehicle with a new name; `Vehicle.to_toml` gives the text of its file."""
         return saved_vehicle(self, name)
 
 
@@ -142,21 +142,21 @@ def diagnose(
     options: ReadOptions | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
-    """Find where a vehicle's model and its flights differ, which physics was left out, and the model with it.
+    """Find where a vehicle's model and its flights differ, which physics the model lacks, and fit these effects.
 
     Args:
         recordings: flights of one drone: recordings or paths.
         vehicle: the nominal model: a Vehicle, a preset's name or a file; None: the one that was flown.
-        held_out: flights only to judge by, unless only these move.
-        baseline: flights of the healthy drone, two or more: its own trim and thrust, and how its days differ.
+        held_out: flights used for evaluation only; if only these flights manoeuvre, they are used for fitting too.
+        baseline: two or more flights of the healthy drone, for its trim and thrust and their day-to-day variation.
         against: a simulated recording of the same mission, to compare the first recording with.
         candidates: effects to look for; none: the whole catalogue.
         withhold: signals to leave unused, such as "pm.vbat".
-        strict_held_out: fit nothing to `held_out`, even where the others only hover.
+        strict_held_out: never fit to `held_out`, even if the other flights only hover.
         method: deprecated, changes nothing.
-        jobs: threads; None: one a core. The result is the same for any number.
+        jobs: threads; None: one per core. The result is the same for any number.
         options: how paths are read.
-        progress: told in a few words what is being done; by several threads.
+        progress: called with a short description of the current step, by several threads.
 
     Raises:
         UsageError: no such file, vehicle or effect. FileFormatError: no recording, or no vehicle.
@@ -188,7 +188,7 @@ def diagnose(
 def _with_plans(
     found: by_recordings.Diagnosis, plans: list[str], document: dict[str, Any], pictures: dict[str, Series]
 ) -> Diagnosis:
-    """A diagnosis with its document, and in both the commands that plan a flight to tell look-alikes apart."""
+    """A diagnosis with its document; both get the commands that plan a flight to tell look-alikes apart."""
     document["would_separate"] = [*document["would_separate"], *plans]
     values = {f.name: getattr(found, f.name) for f in fields(found)}
     values["would_separate"] = (*found.would_separate, *plans)

@@ -1,4 +1,4 @@
-"""Fly a drone, or the simulated firmware, and let it learn its own mass and inertia on the way."""
+"""Fly a drone, or the simulated firmware, and estimate its mass and inertia in flight."""
 
 import contextlib
 from collections.abc import Callable, Sequence
@@ -57,26 +57,26 @@ class FlightSettings:
 
     @property
     def trajectory_name(self) -> str:
-        """In words."""
+        """The trajectory in words."""
         return " ".join(self.trajectory) if isinstance(self.trajectory, tuple) else "a trajectory of the caller's"
 
 
 class FlightObserver:
-    """Who watches a flight; this one watches nothing. The command shows lines, a live view and a stream."""
+    """Callbacks of a flight. These do nothing; the command `fly` shows lines, a live view and a stream."""
 
     def say(self, sentence: str) -> None:
-        """Progress before the flight."""
+        """Receives a sentence about the progress before the flight."""
 
     def recorder(self, recorder: Recorder | None) -> Recorder | None:
-        """The recorder that the session is to have."""
+        """Returns the recorder for the session; may wrap the given one."""
         return recorder
 
     def interrupts(self) -> Interrupts:
-        """What counts the user's wishes to end the flight; asked for once, before the drone is connected."""
+        """Returns the counter of the user's requests to end the flight; called once, before connecting the drone."""
         return Interrupts()
 
     def progress(self, session: Session, interrupts: Interrupts) -> AbstractContextManager[Progress]:
-        """What is told once a second, for the length of the flight."""
+        """Returns a context manager around the flight; it yields a function that is called once a second."""
         return contextlib.nullcontext(lambda phase, seconds: None)
 
 
@@ -104,7 +104,7 @@ def fly(
     false_alarms_per_hour: float | None = None,
     on_fault: Callable[[Fault], None] | None = None,
 ) -> FlightResult:
-    """Take off, fly a trajectory, land, and estimate mass and inertia all along.
+    """Take off, fly a trajectory, land, and estimate mass and inertia during the whole flight.
 
     An exception in the flight, such as KeyboardInterrupt, lands the drone before the exception goes on.
 
@@ -116,20 +116,20 @@ def fly(
             a maker of trajectories.
         duration: of a named trajectory, s; of "informative", at most.
         goal: of "informative": relative half width of the 95 % intervals of mass, Ixx, Iyy, Izz at which it ends.
-        push: write what was learnt to the controller: True, False, or None: to simulators only.
-        dry_run: decide what would be written, and write nothing.
-        policy: of the guard; None: the shipped one.
-        record, append: an MCAP file for everything; continue an existing one as its next session.
-        scenario, seed, speed: of the simulated firmware: file of its truth, its noise, times real time.
-        rate, reconnect: of the log, Hz; how long a lost link is tried again, s.
+        push: write the estimates to the controller: True, False, or None: to simulators only.
+        dry_run: decide which values would be written, but write nothing.
+        policy: rules of the guard on writes; None: the shipped policy.
+        record, append: MCAP file for the recording; whether to add to an existing file as a new session.
+        scenario, seed, speed: of the simulated firmware: file with the true parameters, noise, multiple of real time.
+        rate, reconnect: log rate, Hz; time for which a lost link is tried again, s.
         window, every: newest samples that an update uses; samples between updates.
-        monitor: whether faults in flight are looked for; None: as the policy says.
-        false_alarms_per_hour: of the monitor; None: as the policy says.
+        monitor: whether to look for faults in flight; None: as in the policy.
+        false_alarms_per_hour: of the monitor; None: as in the policy.
         on_fault: called in the estimator's thread with every report of the monitor (`Fault`); must return at once.
 
     Raises:
         UsageError: an argument that does not fit. LinkError: no drone, or the drone was lost.
-        DataError: nothing was flown that could be estimated from. CrazyemError: the flight ended early.
+        DataError: the flight gave no usable data for an estimate. CrazyemError: the flight ended early.
     """
     chosen = (trajectory,) if isinstance(trajectory, str) else trajectory
     settings = FlightSettings(
@@ -150,7 +150,7 @@ def fly(
 
 
 def simulated(uri: str) -> bool:
-    """Whether a URI is a simulator's: UDP on this host, or none at all, which starts one. All else may be a drone."""
+    """Whether a URI is a simulator's: UDP on this host, or an empty URI, which starts one. Others may be drones."""
     if not uri:
         return True
     try:
@@ -163,7 +163,7 @@ def simulated(uri: str) -> bool:
 def write_rules_for(
     uri: str, *, push: bool | None = None, dry_run: bool = False, policy: Policy | str | Path | None = None
 ) -> WriteRules:
-    """Policy and mode of the guard: simulators are written to, drones only where `push` says so.
+    """Policy and mode of the guard: it writes to simulators by default, to drones only if `push` is true.
 
     Raises:
         UsageError: no such policy. FileFormatError: the file is no policy.
@@ -178,7 +178,7 @@ def observed_flight(
 ) -> tuple[FlightResult | None, BaseException | None]:
     """The flight of `fly` with an observer.
 
-    Returns: the result, None where nothing could be estimated; and what ended the flight early, if anything.
+    Returns: the result, None if nothing could be estimated; and the error that ended the flight early, or None.
 
     Raises:
         CrazyemError: nothing has flown.
@@ -200,7 +200,7 @@ def observed_flight(
         push=settings.push,
         rules=settings.rules,
     )
-    estimator_for(nominal, window=settings.window, every=settings.every)  # a wrong window is refused here
+    estimator_for(nominal, window=settings.window, every=settings.every)  # raises here if the window is invalid
     with contextlib.ExitStack() as stack:
         if informative is not None:
             stack.callback(informative.close)
@@ -210,7 +210,7 @@ def observed_flight(
         if not uri:
             simulator = Simulator(scenario=settings.scenario, seed=settings.seed or 0, speed=settings.speed or 1.0)
             stack.callback(simulator.stop)
-            simulator.launch()  # both may have to compile: side by side
+            simulator.launch()  # simulator and estimator may both have to compile, so they do it in parallel
         if seconds := warm_up(nominal):
             observer.say(f"compiled the estimator in {seconds:.0f} s (once per installation)")
         if simulator is not None:
@@ -220,7 +220,7 @@ def observed_flight(
 
 
 def _informative(settings: FlightSettings, vehicle: Vehicle) -> Informative:
-    """Raises UsageError: a flight of this length, or this vehicle, has no room for a manoeuvre."""
+    """The informative trajectory. Raises UsageError: the flight is too short, or the vehicle has no rotor data."""
     if settings.duration < SEGMENT:
         raise UsageError(f"--trajectory informative needs at least {SEGMENT:g} s.")
     if not vehicle.arm[0] or not vehicle.torque_per_thrust:

@@ -1,4 +1,4 @@
-"""What users hand to the functions of the API: recordings and vehicles, as objects or by where they are."""
+"""Arguments of the API functions: recordings and vehicles, as objects or as names and paths."""
 
 from pathlib import Path
 
@@ -14,12 +14,12 @@ VehicleLike = Vehicle | str | Path
 
 
 def recording_of(given: RecordingLike, options: ReadOptions | None = None) -> Recording:
-    """The recording itself, or that of a path. Raises as `open_recording`."""
+    """The given recording, or the recording at a path. Raises as `open_recording`."""
     return given if isinstance(given, Recording) else open_recording(given, options)
 
 
 def vehicle_of(given: VehicleLike | None, recording: Recording | None = None) -> Vehicle:
-    """The vehicle itself, a preset or file; None: that of the recording (see `doctor.thrust.vehicle_for`).
+    """The given vehicle, preset or file; None: the vehicle of the recording (see `doctor.thrust.vehicle_for`).
 
     Raises:
         UsageError: no such vehicle. FileFormatError: the file is no vehicle.

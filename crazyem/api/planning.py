@@ -1,4 +1,4 @@
-"""Plan a flight that narrows intervals, or that tells two explanations apart."""
+"""Plan a flight that narrows intervals, or a flight that tells two effects apart."""
 
 import json
 import math
@@ -35,18 +35,20 @@ def plan(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Plan:
-    """Plan the flight that tells most, within limits. Nothing is flown.
+    """Plan the most informative flight within limits. Nothing is flown.
+
+    `parameters`, `split` and `diagnosis` are goals; at most one is given.
 
     Args:
-        vehicle: what is flown, as far as known: a Vehicle, a preset's name or a file.
-        parameters: whose intervals are to become narrow; none of the three goals: mass, Ixx, Iyy, Izz.
-        split: two effects that are to be told apart.
-        diagnosis: JSON of a diagnosis: its first group of look-alikes is to be told apart.
+        vehicle: the present model of the drone: a Vehicle, a preset's name or a file.
+        parameters: parameters whose intervals should become narrow; mass, Ixx, Iyy, Izz if no goal is given.
+        split: two effects to tell apart.
+        diagnosis: JSON of a diagnosis; the goal is to tell apart its first pair of look-alikes.
         box: m, full widths along x, y, z. tilt: deg. duration: s.
-        criterion: of parameters: "D" (volume of the joint interval) or "A" (sum of relative variances).
-        noise: JSON of an earlier flight or replay of the same drone, whose noise is expected again.
+        criterion: for `parameters`: "D" (volume of the joint interval) or "A" (sum of relative variances).
+        noise: JSON of an earlier flight or replay of the same drone, which gives the expected noise.
         starts, seed: of the search; the same seed gives the same plan.
-        progress: told a line for each start.
+        progress: called with a line for each start.
 
     Raises:
         UsageError: arguments that do not fit; an unknown name. FileFormatError: a file that cannot be used.
@@ -75,7 +77,7 @@ def look_alikes(path: str | Path) -> list[tuple[str, str]]:
     """Pairs of effects that a diagnosis could not tell apart, from its JSON.
 
     Raises:
-        UsageError: no such file, or nothing is left to be told apart. FileFormatError: the file is no diagnosis.
+        UsageError: no such file, or the diagnosis has no such pair. FileFormatError: the file is no diagnosis.
     """
     data = _json(path, "diagnosis")
     groups = data.get("indistinguishable") if data.get("format") == "crazyem-diagnosis" else None
@@ -91,11 +93,11 @@ def look_alikes(path: str | Path) -> list[tuple[str, str]]:
 
 
 def plan_commands(groups: Sequence[Sequence[str]], vehicle: Vehicle, name: str) -> list[str]:
-    """For each group of look-alikes that a manoeuvre tells apart, a sentence with the command that plans it.
+    """Sentences with commands that plan a flight, one for each pair of look-alikes that a manoeuvre can tell apart.
 
     Args:
-        groups: effects, as `indistinguishable` of a diagnosis has them.
-        vehicle: of the diagnosis. name: what the command is to call it.
+        groups: names of effects, as in `indistinguishable` of a diagnosis.
+        vehicle: of the diagnosis. name: of the vehicle in the command.
     """
     limits, found = Limits(), []
     for group in groups:
@@ -112,7 +114,7 @@ def noise_of(path: str | Path, vehicle: Vehicle) -> Noise:
     """Noise scales from the summary of a flight or replay, in the estimator's units of acceleration.
 
     Raises:
-        UsageError: no such file. FileFormatError: the file has no noise.
+        UsageError: no such file. FileFormatError: the file has no noise scales.
     """
     data = _json(path, "summary")
     estimate = data.get("estimate", data)

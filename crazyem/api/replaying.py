@@ -1,4 +1,4 @@
-"""The estimator of the live loop over a recording, sample by sample in the recorded order."""
+"""Run the estimator of the live loop on a recording, sample by sample in the recorded order."""
 
 from collections.abc import Callable
 
@@ -20,8 +20,8 @@ from crazyem.recordings.thrust import kind_objection, signal_for, weight_objecti
 from crazyem.signals.sample import ESTIMATOR_SIGNALS
 from crazyem.vehicle import Vehicle
 
-WINDOW, EVERY = 800, 4  # samples in the window, and between updates, where neither user nor recording says
-Progress = Callable[[float, History], None]  # seconds since the first sample, and what is known by then
+WINDOW, EVERY = 800, 4  # samples in the window, and between updates: defaults without values of user or recording
+Progress = Callable[[float, History], None]  # seconds since the first sample, and the history up to then
 
 
 def replay(
@@ -44,7 +44,7 @@ def replay(
         every: samples between updates; None: as in the flight, else 4.
         options: how a path is read.
         progress: called after every sample.
-        monitor: whether faults are looked for as in flight; `history.faults` has them.
+        monitor: whether to look for faults as in flight; `history.faults` has them.
         false_alarms_per_hour: of the monitor; None: as in the shipped policy.
 
     Raises:
@@ -85,7 +85,7 @@ def replay(
 
 
 def _feed(pipeline: Pipeline, recording: Recording, progress: Progress | None) -> None:
-    """Every sample, in the order in which the live loop had it."""
+    """Give every sample to the pipeline, in the order of the live loop."""
     first: float | None = None
     for sample in recording.samples():
         first = sample.time if first is None else first
@@ -102,7 +102,7 @@ def _notices(recording: Recording, findings: list[Finding], left_out: str, weigh
 def _estimator_of(
     recording: Recording, nominal: Vehicle, thrust_from: str, *, window: int, every: int
 ) -> StepAwareEstimator:
-    """A live flight takes the signal that comes first, and a replay must do the same; but never what says nothing."""
+    """The estimator for a replay, with the first input signal as in flight, except if that signal is unusable."""
     unfit = [n for n in ("rotor_speed", "motor_command") if n in recording.signals and n != thrust_from]
     return estimator_for(
         nominal, onboard=onboard_attitude(recording), crazyflie=crazyflie_attitude(recording), window=window,
@@ -111,7 +111,7 @@ def _estimator_of(
 
 
 def _window_of(recording: Recording, window: int | None, every: int | None) -> dict[str, int]:
-    """Window and samples between updates: as asked for, else as in the flight, else ours."""
+    """Window and samples between updates: the arguments, else the values of the flight, else the defaults."""
     configured = recording.metadata.get("configuration", {})
     return {
         "window": int(configured.get("window", WINDOW)) if window is None else window,
@@ -126,10 +126,10 @@ SCALE_NOTICE = (
 
 
 def required_signals(recording: Recording, vehicle: Vehicle) -> tuple[str, list[str]]:
-    """The signal that thrust is computed from, and all that the estimator needs of this recording.
+    """The signal from which thrust is computed, and all signals that the estimator needs from this recording.
 
     Raises:
-        DataError: there is nothing to compute thrust from, or its voltage is not known.
+        DataError: no signal gives the thrust, or the voltage for it is unknown.
     """
     if other := kind_objection(recording):
         raise DataError(f"{recording.path}: {other}.")
@@ -148,7 +148,7 @@ def required_signals(recording: Recording, vehicle: Vehicle) -> tuple[str, list[
 
 
 def check_flown(recording: Recording, vehicle: Vehicle, air: Airtime, samples: int | None = None) -> None:
-    """Raise DataError, saying why, if nothing was flown: by the recording, or (`samples` 0) by the estimator's gate."""
+    """Raise DataError with the reason if nothing was flown, by the recording or as the estimator used 0 `samples`."""
     if air.known and not air.airborne:
         raise DataError(f"{recording.path}: nothing was flown in this recording: {air.reason}.")
     if samples == 0:
@@ -157,20 +157,20 @@ def check_flown(recording: Recording, vehicle: Vehicle, air: Airtime, samples: i
 
 
 def doctors_findings(recording: Recording) -> list[Finding]:
-    """What the doctor finds that bears on an estimate: more than harmless, of a signal that the estimator uses."""
+    """Findings of the doctor that matter for an estimate: not harmless, on a signal that the estimator uses."""
     used = {*ESTIMATOR_SIGNALS, ""}
-    # the weight is judged by the vehicle of the replay
+    # the weight check is left out: `weight_objection` uses the vehicle of the replay
     found = [f for f in examine(recording) if f.grade is not Grade.HARMLESS and f.check != "weight"]
     return [f for f in found if f.signal in used]
 
 
 def sentence(clause: str) -> str:
-    """A clause as a sentence; "" stays."""
+    """A clause with a capital first letter; "" stays."""
     return clause[:1].upper() + clause[1:]
 
 
 def packet_counts(recording: Recording) -> tuple[int, int]:
-    """Log packets received and lost, as counted in flight; of a foreign file samples, and those that carry nothing."""
+    """Log packets received and lost, as counted in flight; for a foreign file, all samples and the marked samples."""
     counted = recording.metadata.get("statistics", {})
     if "received" in counted:
         return int(counted["received"]), int(counted["lost"])
@@ -180,7 +180,7 @@ def packet_counts(recording: Recording) -> tuple[int, int]:
 
 
 def take_events(recording: Recording, history: History) -> None:
-    """Phases and pushes of a flight of ours, so that the summary can tell before from after."""
+    """Copy phases and pushes of a crazyem flight to the history, so that the summary can compare before and after."""
     for event in recording.events:
         text = str(event.data.get("message", ""))
         if event.kind == "log" and text.startswith("mark "):

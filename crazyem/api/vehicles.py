@@ -1,4 +1,4 @@
-"""Files of simulators for scripts and notebooks: made, checked by flights, and sampled."""
+"""Simulator files for scripts and notebooks: convert them, check them with flights, and draw vehicles."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -33,17 +33,17 @@ def convert_vehicle(
     base: VehicleLike | None = None,
     flight: RecordingLike | None = None,
 ) -> Conversion:
-    """Make a simulator's file of a vehicle, or a vehicle file of a simulator's.
+    """Convert a vehicle to a simulator's file, or a simulator's file to a vehicle file.
 
     Args:
         source: a Vehicle, a preset's name, a vehicle file or a simulator's file.
         to: the format: crazyflow, gym-pybullet-drones, mujoco, gazebo, rotorpy, crazyswarm2, px4-sih, omnidrones, l2f;
             crazyem for a vehicle file.
-        template: a file of that format, of which all else stays.
-        name: of the drone in files that have several.
-        suffix: of the file to be: ".json" makes rotorpy's dict JSON.
-        base: what a simulator's file does not say.
-        flight: tells what the file cannot hold by this flight instead of a made one.
+        template: a file of that format; only the constants in it change.
+        name: of the drone, if a file has several.
+        suffix: of the output file: ".json" makes rotorpy's dict JSON.
+        base: vehicle that gives the values missing in a simulator's file.
+        flight: recording on which the costs of omissions are computed; None: a synthetic flight.
 
     Raises:
         UsageError: no such file, format or drone. FileFormatError: a file cannot be used; names the field.
@@ -58,18 +58,18 @@ def convert_vehicle(
 
 @dataclass(frozen=True, eq=False)
 class VehicleCheck:
-    """What flights say of a simulator's file.
+    """The result of checking a simulator's file with flights.
 
     Attributes:
-        imported: the file. vehicle: what it says, with what it does not say from elsewhere.
-        diagnosis: by the flights.
-        fields: each field of the file.
-        alternatives: mass and thrust, which no flight tells apart.
+        imported: the file. vehicle: its constants; missing values come from `base`.
+        diagnosis: of the vehicle on the flights.
+        fields: a finding for each field of the file.
+        alternatives: corrected constants if the mass, or if the thrust of the file is right; flights give their ratio.
         disagreements: with other files of the same drone.
-        corrected: the file with what was found.
-        errors: after half a second of open-loop flight: "before", "after" (the corrected file), "fitted" (with all that
-            was found) -> quantity.
-        judged: by the flights of these names.
+        corrected: the file with fitted constants.
+        errors: after half a second of open-loop flight: "before", "after" (the corrected file), "fitted" (all fitted
+            effects) -> quantity -> error.
+        judged: names of the flights on which the errors are computed.
     """
 
     imported: SimulatorFile
@@ -84,7 +84,7 @@ class VehicleCheck:
 
     @property
     def fits(self) -> bool:
-        """Whether the file agrees with itself, with others and with the flights."""
+        """Whether the file agrees with itself, with the other files and with the flights."""
         return not (any(t.off for t in self.fields) or self.imported.contradictions or self.disagreements)
 
     def to_dict(self) -> dict[str, Any]:
@@ -140,15 +140,15 @@ def check_vehicle(
     options: ReadOptions | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> VehicleCheck:
-    """Find what is wrong in a simulator's file, by flights of the drone.
+    """Find wrong constants in a simulator's file, using flights of the drone.
 
     Args:
-        file: of any known format.
+        file: simulator's file of any known format.
         recordings, held_out: as for `diagnose`.
-        name: which drone of a file that has several.
-        beside: other files of the same drone, which should say the same.
-        base: what the file does not say (default: the vehicle that was flown).
-        mass: of the whole drone, where it was weighed [kg].
+        name: of the drone, if the file has several.
+        beside: other files of the same drone, to compare with.
+        base: vehicle that gives the values missing in the file (default: the vehicle that was flown).
+        mass: weighed mass of the whole drone [kg]; None: not weighed.
         candidates: effects to look for; none: the whole catalogue.
         tolerance: relative difference up to which a number may stay.
 
@@ -198,17 +198,17 @@ def _field_findings(
 def sample_vehicle(
     vehicle: VehicleLike, count: int = 256, *, seed: int = 0, days: bool = True, mass_sd: float = MASS_SD
 ) -> VehicleSample:
-    """Draw drones as a fitted vehicle may be, by the joint posterior in its file.
+    """Draw vehicles from the joint posterior in the file of a fitted vehicle.
 
     Args:
-        vehicle: as `diagnose` fitted it.
-        count: how many.
-        seed: the same seed gives the same drones.
-        days: other days than those of the flights.
-        mass_sd: relative standard deviation of the mass, which no flight tells; 0 where it was weighed.
+        vehicle: fitted by `diagnose`.
+        count: number of vehicles.
+        seed: the same seed gives the same vehicles.
+        days: whether to add the day-to-day variation of thrust, trim and lag.
+        mass_sd: relative standard deviation of the mass, which flights do not identify; 0 for a weighed drone.
 
     Raises:
-        UsageError: no such vehicle, or it has no posterior. DataError: hardly any drone of its posterior can be.
+        UsageError: no such vehicle, or it has no posterior. DataError: hardly any draw is physically possible.
     """
     return sample(vehicle_of(vehicle), count, seed=seed, days=days, mass_sd=mass_sd)
 
@@ -226,19 +226,20 @@ def predict_ensemble(
     plain: bool = False,
     options: ReadOptions | None = None,
 ) -> Ensemble:
-    """Predict a band by many drones of a fitted vehicle's posterior, from starts all along a flight.
+    """Predict a band from many draws of a fitted vehicle's posterior, from starts all along a flight.
 
     Args:
         recording: the flight.
-        vehicle: with a posterior. count: drones.
+        vehicle: with a posterior. count: number of draws.
         horizon: steps ahead. step: s each; None: the recorded samples.
         seed: of the draws.
-        days: the trim, thrust and lag of another day: far wider, as recorded commands answer to the trim of theirs.
-        calibrate: other flights, by which disturbances are learned; without, the band is of constants alone.
-        plain: the model alone, not corrected by the flight before each start.
+        days: add day-to-day variation of trim, thrust and lag. The band is far wider, because the recorded commands
+            compensate the trim of their own day.
+        calibrate: other flights from which disturbances are learned; without them, the band covers constants only.
+        plain: use the model alone, without correction by the flight before each start.
 
     Raises:
-        UsageError: no such file, or no posterior. DataError: no whole states, or no flight that is long enough.
+        UsageError: no such file, or no posterior. DataError: no complete states, or no flight that is long enough.
     """
     flight = recording_of(recording, options)
     fitted = vehicle_of(vehicle, flight)
@@ -249,7 +250,7 @@ def predict_ensemble(
 
 
 def disagreements(first: SimulatorFile, second: SimulatorFile) -> list[str]:
-    """Sentences about the quantities in which two files of one drone differ by more than a hundredth."""
+    """Sentences on the quantities in which two files of one drone differ by more than 1 %."""
     found = []
     for quantity in NUMBERS:
         a, b = getattr(first.constants, quantity), getattr(second.constants, quantity)
@@ -268,7 +269,7 @@ def _errors(recording: Any, vehicles: Mapping[str, Vehicle]) -> dict[str, dict[s
 
 
 def _pooled(errors: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
-    """The root of the mean square over flights. Raises DataError if there is none."""
+    """Root mean square of the errors over flights. Raises DataError if there is no flight."""
     if not errors:
         raise DataError("no flight is long enough and has whole states, so open-loop errors cannot be told")
     return {
