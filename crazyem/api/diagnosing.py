@@ -147,12 +147,12 @@ def diagnose(
     Args:
         recordings: flights of one drone: recordings or paths.
         vehicle: the nominal model: a Vehicle, a preset's name or a file; None: the one that was flown.
-        held_out: flights used for evaluation only; if only these flights manoeuvre, they are used for fitting too.
+        held_out: flights for evaluation only. If all `recordings` hover and these do not, the roles are exchanged.
         baseline: two or more flights of the healthy drone, for its trim and thrust and their day-to-day variation.
         against: a simulated recording of the same mission, to compare the first recording with.
         candidates: effects to look for; none: the whole catalogue.
         withhold: signals to leave unused, such as "pm.vbat".
-        strict_held_out: never fit to `held_out`, even if the other flights only hover.
+        strict_held_out: never exchange the roles of `recordings` and `held_out`.
         method: deprecated, changes nothing.
         jobs: threads; None: one per core. The result is the same for any number.
         options: how paths are read.
