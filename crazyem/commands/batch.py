@@ -1,4 +1,4 @@
-"""One function over many files: in this process, in processes of this machine, or on a Dask cluster."""
+"""Apply one function to many files: in this process, in processes of this machine, or on a Dask cluster."""
 
 import argparse
 import contextlib
@@ -14,7 +14,7 @@ from crazyem.commands.workers import shared
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.extras import require
 
-CONNECT_SECONDS = 10.0  # to a scheduler, and for its first worker
+CONNECT_SECONDS = 10.0  # s: time limit to connect to a scheduler, and to wait for its first worker
 
 
 def each(
@@ -27,16 +27,16 @@ def each(
     cluster: str | None = None,
     unit: str = "files",
 ) -> Iterator[Result]:
-    """Results of `function(*task)`, in the order of the tasks, as they become known; progress on standard error.
+    """Yield the results of `function(*task)` in the order of the tasks; progress goes to standard error.
 
     Args:
-        function: of a module, so that other processes can find it; returns a `Result`.
+        function: a function at module level, so that other processes can import it; returns a `Result`.
         tasks: arguments of one call each.
         names: the file of each task; a call that raises becomes a failed result of that name.
-        what: the command, for progress.
-        jobs: processes; None: one a core, but none for a single task.
+        what: name of the command, for progress.
+        jobs: processes; None: one per core, but none for a single task.
         cluster: address of a Dask scheduler, whose workers see the same files under the same names.
-        unit: what the tasks are, for progress.
+        unit: plural noun for the tasks, for progress.
 
     Raises: UsageError (no `distributed`, wrong address), LinkError (nothing answers there).
     """
@@ -57,11 +57,11 @@ def on_files(
     *,
     apart: bool = False,
 ) -> None:
-    """`work(path, *rest)` of each file of a command, as --jobs and --cluster say; the results go to the report.
+    """Call `work(path, *rest)` for each file of a command, by --jobs and --cluster, and add the results to the report.
 
     Args:
         rests: further arguments for each file.
-        apart: with an empty line between two results.
+        apart: whether to put an empty line between two results.
     """
     names = [str(f.path) for f in files.found]
     tasks = [(name, *rest) for name, rest in zip(names, rests)]
@@ -73,14 +73,14 @@ def on_files(
 
 
 def close(report: Report, files: Files) -> int:
-    """The count of files where there were several, and the JSON; returns the exit code."""
+    """Print the count of files if there are several, write the JSON and return the exit code."""
     if len(files.found) > 1 or files.skipped:
         report.say(counted(report.results, files.skipped))
     return report.close(skipped_files=files.skipped)
 
 
 def counted(results: Sequence[Result], skipped: int) -> str:
-    """How many files were read, failed and passed over, in one line."""
+    """One line with the numbers of files that were read, failed and skipped."""
     failed = sum(bool(r.error) for r in results)
     parts = [f"{len(results) - failed} recordings"]
     if failed:
@@ -91,7 +91,7 @@ def counted(results: Sequence[Result], skipped: int) -> str:
 
 
 def processes(jobs: int | None, files: int) -> int:
-    """How many files are worked on at a time: `jobs`, else one a core, and never more than there are."""
+    """Number of files processed in parallel: `jobs`, else one per core, and never more than `files`."""
     return min(jobs or _cores(), files)
 
 
@@ -120,7 +120,7 @@ def _on_cluster(calls: list[Any], address: str, stack: contextlib.ExitStack) -> 
             yield futures.popleft().result()
     except TimeoutError:
         raise LinkError(f"the cluster at {address} has no worker.") from None
-    except Exception as error:  # not of the work, see `_guarded`: a worker was killed, the scheduler has gone
+    except Exception as error:  # `_guarded` catches errors of the work; this is a killed worker or lost scheduler
         what = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise CrazyemError(f"the cluster at {address} ended before its work was done ({what}).") from None
 

@@ -1,4 +1,4 @@
-"""What the commands share: results to files and terminal, and errors that wait until those are written."""
+"""Functions shared by the commands: write results to files and terminal, and raise errors after writing."""
 
 import argparse
 import sys
@@ -15,15 +15,15 @@ from crazyem.vehicle import Vehicle
 
 
 def say(line: str) -> None:
-    """Progress goes to standard error, so that `--json -` leaves standard output to the summary."""
-    print(f"{line}\n", end="", file=sys.stderr, flush=True)  # in one piece, whoever else prints
+    """Print progress to standard error, so that `--json -` leaves standard output to the summary."""
+    print(f"{line}\n", end="", file=sys.stderr, flush=True)  # one write, so that lines of several threads do not mix
 
 
 class LiveLine:
-    """Prints a line each second about a session, and remembers what it was told for the live view.
+    """Prints a line about a session each second, and keeps phase and seconds for the live view.
 
     Attributes:
-        quiet: whether something else shows it now.
+        quiet: returns whether the live view shows the session now, so that no line is printed.
     """
 
     def __init__(self, session: Any, *, prefix: str = "") -> None:
@@ -45,7 +45,7 @@ class LiveLine:
 
 
 def say_steps(history: History, told: int, *, prefix: str = "") -> int:
-    """A line for each step of mass that was decided since `told` of them were; returns how many are told now."""
+    """Print a line for each decided step of mass after the first `told` steps; returns the new number of told steps."""
     for step in history.steps[told:]:
         if step.real is None:
             break
@@ -56,7 +56,7 @@ def say_steps(history: History, told: int, *, prefix: str = "") -> int:
 
 
 def say_faults(history: History, told: Sequence[Fault], *, prefix: str = "") -> Sequence[Fault]:
-    """A line for each fault that is not among those `told`; one whose size has settled is told again."""
+    """Print a line for each fault not in `told`; a fault appears again once its estimated size has settled."""
     faults = history.faults
     for fault in faults:
         if fault not in told:
@@ -65,7 +65,7 @@ def say_faults(history: History, told: Sequence[Fault], *, prefix: str = "") -> 
 
 
 def plot_path(arguments: argparse.Namespace, *others: str | None) -> str | None:
-    """--plot, or a PNG beside the recording or the summary; None where no file was asked for, or nothing can draw.
+    """--plot, or a PNG beside the recording or the summary; None without such a file or without matplotlib.
 
     Raises: MissingExtraError: --plot without matplotlib.
     """
@@ -87,7 +87,7 @@ def plot_path(arguments: argparse.Namespace, *others: str | None) -> str | None:
 
 
 def report(arguments: argparse.Namespace, result: FlightResult, *, plot: str | None) -> None:
-    """Summary on the terminal, JSON and plot, where these are wanted. Raises UsageError: a file cannot be written."""
+    """Print the summary; write JSON and plot if requested. Raises UsageError: a file cannot be written."""
     text = str(result)
     if arguments.json == "-":
         say(text)
@@ -104,20 +104,20 @@ def report(arguments: argparse.Namespace, result: FlightResult, *, plot: str | N
 
 
 def raise_after(error: BaseException | None) -> None:
-    """Raise what ended a flight, once its results are on disk."""
+    """Raise the error that ended a flight; called after its results are on disk."""
     if error is not None:
         raise error
 
 
 def new_estimator(vehicle: Vehicle, arguments: argparse.Namespace, *, crazyflie: bool = True) -> Any:
-    """The estimator with the window of the command line; `crazyflie`: its filter makes the attitudes."""
+    """The estimator with the window of the command line; `crazyflie`: attitudes come from the Crazyflie's filter."""
     from crazyem.estimation.steps import estimator_for
 
     return estimator_for(vehicle, window=arguments.window, every=arguments.every, crazyflie=crazyflie)
 
 
 def compile_kernels(vehicle: Vehicle) -> None:
-    """Compile before anything flies, and say so where it took its time."""
+    """Compile the estimator before flight, and print a line if compiling was necessary."""
     from crazyem.live.warm_up import warm_up
 
     if seconds := warm_up(vehicle):

@@ -1,4 +1,4 @@
-"""`crazyem diagnose RECORDING...`: where simulation and recording part, which physics was left out, and the fit."""
+"""`crazyem diagnose RECORDING...`: differences of simulation and recording, the missing physics, and the fit."""
 
 import argparse
 import sys
@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
     begin = time.monotonic()
 
     def say(text: str) -> None:
-        # in one piece: threads speak at once
+        # one write, so that lines of several threads do not mix
         sys.stderr.write(f"diagnose: {time.monotonic() - begin:5.1f} s  {text}\n")
         sys.stderr.flush()
 

@@ -1,4 +1,4 @@
-"""`crazyem doctor FILE...`: what is wrong with recordings, and with --fix the lossless repairs into new files."""
+"""`crazyem doctor FILE...`: find faults in recordings; --fix writes new files with lossless repairs."""
 
 import argparse
 import math
@@ -16,7 +16,7 @@ from crazyem.recordings import Finding, Grade, ReadOptions, Recording, open_reco
 from crazyem.recordings.parts import open_parts, to_be_parted
 
 _TEXT_WIDTH = 110
-_SHOWN_INTERVALS = 4  # intervals that are written out
+_SHOWN_INTERVALS = 4  # most intervals shown per finding
 _WORST_FIRST = sorted(Grade, key=lambda grade: grade.rank)
 
 
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
 def diagnose(
     path: str, options: ReadOptions, output: str | None, force: bool, parts: bool, jobs: int, several: bool
 ) -> Result:
-    """One file. Raises as `open_recording`, and UsageError if the repaired file cannot be written."""
+    """Examine one file. Raises as `open_recording`, and UsageError if the repaired file cannot be written."""
     from crazyem.doctor import examine
     from crazyem.doctor.duplicates import fingerprint
 
@@ -58,7 +58,7 @@ def diagnose(
         source, start, end, found = "", math.inf, -math.inf, []
         for part in open_parts(path, options):
             source = part.source
-            # a slow stream may have nothing to say in a part; that is no finding
+            # a slow signal may have no sample in a part; this is no finding
             signals = {name: array for name, array in part.signals.items() if array.time.size}
             start = min([start, *(float(array.time.min()) for array in signals.values())])
             end = max([end, *(float(array.time.max()) for array in signals.values())])
@@ -78,13 +78,13 @@ def diagnose(
 def _repair(
     recording: Recording, findings: tuple[Finding, ...], output: str, force: bool
 ) -> tuple[dict[str, Any], list[str]]:
-    """Apply what loses nothing and write it; nothing is written where there is nothing to apply."""
+    """Apply the lossless repairs and write the file; without such repairs no file is written."""
     from crazyem.doctor.fix import apply_fixes
     from crazyem.recordings.mcap.signals import write_recording
 
     wanted = [f for f in findings if f.fix is not None]
     repaired, applied = apply_fixes(recording, findings)
-    # by value: a finding may come back as another object that says the same
+    # compare by value: a finding may come back as an equal, but different object
     done = [_key(f) for f in applied]
     left = [f for f in wanted if _key(f) not in done]
     result: dict[str, Any] = {
@@ -140,7 +140,7 @@ def _result(
 
 
 def text_of(finding: Finding) -> str:
-    """A finding for people: grade, check, signal and time; then what, the numbers behind it, what to do."""
+    """A finding for people: grade, check, signal and time; then text, evidence and advice."""
     where = f" {finding.signal}" if finding.signal else ""
     lines = [f"  {str(finding.grade).upper():<9} {finding.check}{where}{_when(finding)}", _wrapped(finding.text)]
     if finding.evidence:

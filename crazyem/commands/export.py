@@ -1,4 +1,4 @@
-"""`crazyem export FILE... -o OUT.csv|OUT.parquet`: recordings as tables for other programs, nothing resampled."""
+"""`crazyem export FILE... -o OUT.csv|OUT.parquet`: write recordings as tables, without resampling."""
 
 import argparse
 
@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def convert(path: str, output: str, options: ReadOptions, force: bool, parts: bool, jobs: int) -> Result:
-    """One file. Raises as `open_recording`; UsageError if the result cannot be written."""
+    """Convert one file. Raises as `open_recording`; UsageError if the result cannot be written."""
     if to_be_parted(path, asked=parts, jobs=jobs):
         description = export_parts(lambda: open_parts(path, options), output, force=force)
     else:

@@ -1,4 +1,4 @@
-"""From what stands on the command line to recordings: files, folders, patterns; and where results of each go."""
+"""Find recordings from command line arguments (files, folders, patterns), and the target files of the results."""
 
 import glob
 import os
@@ -14,8 +14,8 @@ from crazyem.recordings import ReadOptions
 from crazyem.recordings.csv.file import has_mapping
 from crazyem.recordings.registry import READERS, reader_of
 
-# What the reader of any CSV takes in a folder: text with commas is everywhere, so name and columns must fit (with
-# --map the name alone). A file named by the user is always read.
+# Suffixes of CSV files that are taken from a folder. Many text files have commas, so name and columns must fit (with
+# --map only the name). A file named by the user is always read.
 _ANY_CSV, _CSV_NAMES = "CSV", (".csv", ".csv.gz", ".tsv", ".tsv.gz")
 _RECORDING_SUFFIXES = (".gz", ".csv", ".tsv", ".txt", ".mcap", ".ulg", ".tlog", ".bin", ".db3")
 
@@ -26,7 +26,7 @@ class Found:
 
     Attributes:
         path: file, or folder if the format is a folder.
-        below: its folder below the folder that was given ("" for a file that was named): results keep that structure.
+        below: subfolder relative to the given folder ("" for a file given by name); results keep this structure.
     """
 
     path: Path
@@ -35,23 +35,23 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class Files:
-    """What the arguments came to: recordings in order, and how many other files lay among them."""
+    """The recordings for the arguments, in order, and the number of other files in the folders."""
 
     found: tuple[Found, ...]
     skipped: int = 0
 
 
 def find(arguments: Iterable[str], *, mapping: str | None = None) -> Files:
-    """Recordings named by files, folders (searched through) and patterns; each once.
+    """Find the recordings given by files, folders (searched recursively) and patterns; each once.
 
-    In folders and patterns, files that no reader knows are counted, not read; so are hidden ones not even counted.
+    In folders and patterns, files without a known format are counted as skipped; hidden files in folders are ignored.
     A folder that is a recording itself (rosbag2, a cfclient session) counts as one.
 
     Args:
         arguments: of the command line.
-        mapping: --map; with it every CSV file in a folder counts, whatever its columns.
+        mapping: --map; with it every CSV file in a folder is a recording, whatever its columns.
 
-    Raises: UsageError if nothing is left.
+    Raises: UsageError if there is no recording.
     """
     search = _Search(mapped=mapping is not None)
     names = list(arguments)
@@ -81,7 +81,7 @@ class _Search:
             for match in matches:
                 self._matched(Path(match))
         else:
-            self._take(path, "")  # reading it says that it is not there
+            self._take(path, "")  # the file is missing; the reader gives the error
 
     def _named(self, path: Path) -> None:
         if path.is_dir():
@@ -103,7 +103,7 @@ class _Search:
         if _is_recording_folder(top):
             self._take(top, "")
             return
-        entered: set[tuple[int, int]] = set()  # a link to a folder above would go round for ever
+        entered: set[tuple[int, int]] = set()  # avoids an endless loop by a link to a parent folder
         waiting = [top]
         while waiting:
             folder = waiting.pop()
@@ -145,7 +145,7 @@ def _below(folder: Path, top: Path) -> str:
 
 
 def _is(entry: os.DirEntry[str], kind: Any) -> bool:
-    """What an entry is, links followed; False for a link to nothing. Never opens it: a pipe would wait for ever."""
+    """Whether an entry is of a kind, links followed; False for a broken link. Does not open it: a pipe would block."""
     try:
         return bool(kind(entry.stat().st_mode))
     except OSError:
@@ -156,13 +156,13 @@ def _is_recording(path: Path, *, mapped: bool) -> bool:
     try:
         reader = reader_of(path)
     except KnownFileError:
-        # what stands for a recording should not vanish; pictures may be Git LFS pointers, too
+        # placeholders of recordings are kept, so that the user sees an error; other Git LFS pointers may be pictures
         return path.name.lower().endswith(_RECORDING_SUFFIXES)
     except FileFormatError:
-        # of no known format; but a damaged gzip file called .csv.gz should not vanish without a word
+        # unknown format; a .csv.gz file may be a damaged recording and is kept, so that the user sees an error
         return path.name.lower().endswith(".csv.gz")
     except UsageError:
-        return True  # cannot be opened: reading it says why
+        return True  # cannot be opened; the reader gives the error
     if reader.name != _ANY_CSV:
         return True
     if not path.name.lower().endswith(_CSV_NAMES):
@@ -170,7 +170,7 @@ def _is_recording(path: Path, *, mapped: bool) -> bool:
     try:
         return mapped or has_mapping(path)
     except (FileFormatError, UsageError):
-        return True  # damaged: reading it says how
+        return True  # damaged; the reader gives the error
 
 
 def _is_recording_folder(path: Path) -> bool:
@@ -181,7 +181,7 @@ def _is_recording_folder(path: Path) -> bool:
 
 
 def read_options(arguments: Any) -> ReadOptions:
-    """--map, --motor, --as-published; --from and --to of commands that have them."""
+    """Options of the reader: --map, --motor, --as-published; --from and --to if the command has them."""
     start, end = getattr(arguments, "start", None), getattr(arguments, "end", None)
     if start is not None and end is not None and not start < end:
         raise UsageError(f"--from {start:g} is not before --to {end:g}.")
@@ -189,7 +189,7 @@ def read_options(arguments: Any) -> ReadOptions:
 
 
 def stem(path: Path) -> str:
-    """The name of a recording without the suffixes of its format; dots elsewhere in the name stay."""
+    """The name of a recording without the suffixes of its format; other dots in the name stay."""
     name = path.name or path.resolve().name
     lower = name.lower()
     while True:
@@ -200,10 +200,10 @@ def stem(path: Path) -> str:
 
 
 def targets(found: Iterable[Found], output: str | None, suffix: str, *, force: bool) -> list[Path]:
-    """Where the result of each recording goes.
+    """The target file of each recording's result.
 
-    One recording: `output` itself, unless it is an existing folder. Several: `output` is a folder, made if need be, in
-    which folders below those given are kept. None: beside each recording.
+    One recording: `output` itself, unless it is an existing folder. Several: `output` is a folder, created if
+    necessary; subfolders are kept. None: beside each recording.
 
     Raises: UsageError if a result would replace a recording, another result, or (unless `force`) any file.
     """

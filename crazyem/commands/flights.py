@@ -1,4 +1,4 @@
-"""What `fly`, `watch` and swarms share: Ctrl-C, and who is asked before a write."""
+"""Functions shared by `fly`, `watch` and swarms: Ctrl-C, and confirmation by the user before a write."""
 
 import argparse
 import contextlib
@@ -20,7 +20,7 @@ from crazyem.live.write_supervisor import WriteRules
 
 @contextlib.contextmanager
 def interrupts(counter: Interrupts | None = None) -> Iterator[Interrupts]:
-    """Ctrl-C counts instead of raising, so that it can never hit between two commands to a flying drone."""
+    """Count Ctrl-C instead of raising, so that no exception occurs between two commands to a flying drone."""
     counter = counter or Interrupts()
     if threading.current_thread() is not threading.main_thread():
         yield counter
@@ -34,10 +34,10 @@ def interrupts(counter: Interrupts | None = None) -> Iterator[Interrupts]:
 
 
 def write_rules(arguments: argparse.Namespace, uri: str | None = None, *, name: str = "this drone") -> WriteRules:
-    """Policy and mode of the guard: simulators are written to, drones only after --push or --confirm.
+    """Policy and mode of the guard: it writes to simulators by default, to drones only with --push or --confirm.
 
     Args:
-        uri: of the drone; None takes that of the command line.
+        uri: of the drone; None takes the URI of the command line.
         name: of the drone, for sentences.
 
     Raises: UsageError, FileFormatError: the policy cannot be used.
@@ -53,11 +53,11 @@ def write_rules(arguments: argparse.Namespace, uri: str | None = None, *, name: 
     return replace(rules, confirm=confirmation_by(name) if arguments.confirm and not rules.dry_run else None)
 
 
-_TERMINAL_LOCK = threading.Lock()  # one question at a time, whoever asks
+_TERMINAL_LOCK = threading.Lock()  # one question at a time, from all threads
 
 
 def confirmation_by(name: str) -> Callable[[str, threading.Event], bool]:
-    """Asks on the terminal about a drone of that name."""
+    """A function that asks on the terminal about the drone of this name."""
 
     def confirm(question: str, ended: threading.Event) -> bool:
         with _TERMINAL_LOCK:
@@ -67,19 +67,19 @@ def confirmation_by(name: str) -> Callable[[str, threading.Event], bool]:
 
 
 def confirm_in_terminal(question: str, ended: threading.Event) -> bool:
-    """Yes or no from standard input; no where there is none, or once `ended` is set."""
+    """Yes or no from standard input; no if there is no terminal input, or once `ended` is set."""
     say(f"{question}\n  push it, and what follows under the policy? [y/N]")
     while not ended.is_set():
-        # Never blocked in a read: the flight may end before anyone answers.
+        # poll instead of a blocking read: the flight may end before anyone answers
         if select.select([sys.stdin], [], [], 0.2)[0]:
             return sys.stdin.readline().strip().lower() in ("y", "yes")
     return False
 
 
 def follow(session: Session, stop: Interrupts, duration: float | None, line: LiveLine) -> None:
-    """Until Ctrl-C, or `duration` [s] of the drone's clock; a line a second.
+    """Follow a session until Ctrl-C, or for `duration` [s] of the drone's clock; prints a line each second.
 
-    Raises: CrazyemError: what went wrong in the session.
+    Raises: CrazyemError: an error of the session.
     """
     begun, shown = math.nan, time.monotonic()
     while not stop.count:

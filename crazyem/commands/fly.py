@@ -1,4 +1,4 @@
-"""`crazyem fly`: fly a drone, or the simulated firmware, and let it learn its own mass and inertia on the way."""
+"""`crazyem fly`: fly a drone, or the simulated firmware, and estimate its mass and inertia in flight."""
 
 import argparse
 import contextlib
@@ -18,7 +18,7 @@ from crazyem.physics import folding
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """The command; returns the exit code, raises CrazyemError for errors of the user's."""
+    """The command; returns the exit code, raises CrazyemError for errors that the user can cause."""
     if arguments.uris or arguments.swarm:
         from crazyem.commands.swarm import fly as fly_many
 
@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
         false_alarms_per_hour=arguments.false_alarms_per_hour,
     )
     if arguments.trajectory != ["informative"]:
-        trajectory_maker(arguments.trajectory, arguments.duration)  # a wrong one is refused here
+        trajectory_maker(arguments.trajectory, arguments.duration)  # raises here if invalid
         if note := duration_note(arguments.trajectory, arguments.duration):
             say(note)
     plot = plot_path(arguments, arguments.record, arguments.json)
@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _OnTheTerminal(FlightObserver):
-    """Lines or a live view, a stream for Foxglove, and Ctrl-C."""
+    """Observer that shows lines or a live view, streams to Foxglove, and handles Ctrl-C."""
 
     def __init__(self, view: bool, streams: Streams, stack: contextlib.ExitStack) -> None:
         self._view, self._streams, self._stack = view, streams, stack

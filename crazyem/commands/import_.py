@@ -1,4 +1,4 @@
-"""`crazyem import FILE... -o OUT.mcap`: recordings of any format into ours, nothing resampled, nothing left out."""
+"""`crazyem import FILE... -o OUT.mcap`: convert recordings of any format to MCAP, without resampling or omissions."""
 
 import argparse
 from typing import Any
@@ -20,7 +20,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def convert(path: str, output: str, options: ReadOptions, force: bool) -> Result:
-    """One file. Raises as `open_recording`; UsageError if the result cannot be written."""
+    """Convert one file. Raises as `open_recording`; UsageError if the result cannot be written."""
     from crazyem.recordings.mcap.signals import write_recording
 
     recording = open_recording(path, options)
@@ -32,7 +32,7 @@ def convert(path: str, output: str, options: ReadOptions, force: bool) -> Result
 
 
 def summary(recording: Recording) -> dict[str, Any]:
-    """What went over, for JSON."""
+    """Summary of the converted recording, for JSON."""
     return {
         "source": recording.source,
         "duration_s": recording.duration,

@@ -1,4 +1,4 @@
-"""`crazyem info FILE...`: what is in recordings, how hard they flew, what could be identified from them."""
+"""`crazyem info FILE...`: content of recordings, flight envelope, and identifiable parameters."""
 
 import argparse
 from itertools import repeat
@@ -16,7 +16,7 @@ def run(arguments: argparse.Namespace) -> int:
     """The command."""
     report = Report(arguments)
     if arguments.vehicle:
-        folding.load(arguments.vehicle)  # a mistake in it is one error, not one for each file
+        folding.load(arguments.vehicle)  # raises here, so that a wrong vehicle gives one error, not one per file
     files = find(arguments.files, mapping=arguments.map)
     options = read_options(arguments)
     jobs = processes(arguments.jobs, len(files.found))
@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def inspect(path: str, options: ReadOptions, vehicle: str | None, parts: bool, jobs: int, everything: bool) -> Result:
-    """One file. Raises as `open_recording`."""
+    """The inventory of one file. Raises as `open_recording`."""
     from crazyem.doctor.inventory import inventory
 
     drone = folding.load(vehicle) if vehicle else None

@@ -1,4 +1,4 @@
-"""`crazyem layout`: a layout for Foxglove and Lichtblick that shows recordings of ours, or a swarm streamed live."""
+"""`crazyem layout`: a layout for Foxglove and Lichtblick that shows crazyem's recordings or a live swarm."""
 
 import argparse
 import json
@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _layout(arguments: argparse.Namespace) -> dict[str, Any]:
-    """For the drones that are named, of a swarm file or as words, else for one drone without a name."""
+    """The layout for the drones of --swarm or --drones, else for one drone without a name."""
     from crazyem.recordings.mcap.layout import foxglove_layout, swarm_layout
 
     names = list(getattr(arguments, "drones", None) or ())

@@ -1,4 +1,4 @@
-"""`crazyem links`: what a drone could be reached through here, what answers, and what is missing."""
+"""`crazyem links`: interfaces of this computer to drones, drones that answer, and missing requirements."""
 
 import argparse
 from collections.abc import Sequence
@@ -15,11 +15,11 @@ _INTERFACE_TITLES = {
     "udp": "UDP (simulated drones, WiFi)",
     "serial": "Serial ports",
 }
-_PREFERENCE = ("radio", "usb", "udp")  # what can be said to be a drone, nearest to flying first
+_PREFERENCE = ("radio", "usb", "udp")  # interfaces whose devices are drones; the most likely to fly first
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Scan and show; 0 whether anything was found or not: nothing there is an answer, too.
+    """Scan and print the result; returns 0 even if nothing was found.
 
     Raises: UsageError: an unusable port, or the JSON cannot be written.
     """
@@ -47,12 +47,12 @@ def drones(interfaces: Sequence[Interface]) -> list[str]:
 
 
 def summary(interfaces: Sequence[Interface]) -> dict[str, Any]:
-    """For programs."""
+    """The result for programs."""
     return {"interfaces": [i.to_json() for i in interfaces], "drones": drones(interfaces)}
 
 
 def text(interfaces: Sequence[Interface]) -> str:
-    """For people."""
+    """The result for people."""
     lines = []
     for interface in interfaces:
         lines.append(_INTERFACE_TITLES.get(interface.name, interface.name))

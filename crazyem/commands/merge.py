@@ -1,4 +1,4 @@
-"""What parts of a recording too large for memory add up to: one inventory, one list of findings."""
+"""Merge the results for the parts of a recording too large for memory: one inventory, one list of findings."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -16,10 +16,10 @@ _VERDICT_RANK = {"yes": 0, "weak": 1, "no": 2}
 
 
 def merge_inventories(parts: Iterable[Inventory]) -> Inventory:
-    """One inventory of consecutive parts.
+    """Merge the inventories of consecutive parts.
 
-    Counts add up and extremes are exact. A median period is that of the part with the most samples; what could be
-    identified is that of the best part, so it claims too little rather than too much.
+    Counts and extremes are exact. The median period comes from the part with the most samples. Identifiability comes
+    from the best part; the whole recording is at least as informative.
     """
     total: Inventory | None = None
     for part in parts:
@@ -43,7 +43,7 @@ def _add(a: Inventory, b: Inventory) -> Inventory:
         events={kind: a.events.get(kind, 0) + b.events.get(kind, 0) for kind in (*a.events, *b.events)},
         envelope=_add_envelopes(a.envelope, b.envelope),
         verdicts=_united(a.verdicts, b.verdicts, lambda a, b: b if _order(b) < _order(a) else a),
-        # what stands against a part stands against the whole only if no part is free of it
+        # an objection holds for the recording only if it holds for all parts
         on_the_ground=a.on_the_ground and b.on_the_ground,
         no_replay=a.no_replay and b.no_replay,
         unlike=a.unlike and b.unlike,
@@ -51,7 +51,7 @@ def _add(a: Inventory, b: Inventory) -> Inventory:
 
 
 def _united(a: Iterable[Row], b: Iterable[Row], add: Callable[[Row, Row], Row]) -> tuple[Row, ...]:
-    """Rows of both, those of one name added."""
+    """Rows of both; rows with the same name are added."""
     rows = {row.name: row for row in a}
     for row in b:
         rows[row.name] = add(rows[row.name], row) if row.name in rows else row
@@ -87,7 +87,7 @@ def _add_clocks(a: ClockRow, b: ClockRow) -> ClockRow:
 
 
 def _add_envelopes(a: Envelope, b: Envelope) -> Envelope:
-    """Extremes of both; shares and rms weighted by the time in the air."""
+    """Extremes over both; shares and rms are weighted by the time in the air."""
     values: dict[str, Any] = {}
     for field in fields(Envelope):
         name, x, y = field.name, getattr(a, field.name), getattr(b, field.name)
@@ -109,7 +109,7 @@ def _add_envelopes(a: Envelope, b: Envelope) -> Envelope:
 
 
 def _reduced(function: Any, x: Any, y: Any) -> Any:
-    """Extreme of two numbers or of tuples of them, where None is no number."""
+    """Extreme of two numbers, or element-wise of two tuples; None counts as missing."""
     if x is None or y is None:
         return y if x is None else x
     if isinstance(x, tuple):
@@ -127,7 +127,7 @@ def _order(verdict: Verdict) -> tuple[int, float]:
 
 
 def _without_edges(parts: list[tuple[Finding, ...]]) -> list[tuple[Finding, ...]]:
-    """Parts without what is true of a part only because it is one: no flight in it, rotors at work at its ends."""
+    """Findings of the parts without those caused by cutting: a part without a flight, running rotors at its ends."""
     grounded = [any(f.check == "flight" and f.grade is Grade.UNUSABLE for f in findings) for findings in parts]
     if len(parts) < 2 or all(grounded):
         return parts
@@ -150,14 +150,14 @@ def _course(finding: Finding) -> bool:
 
 
 def _key(finding: Finding) -> tuple[str, ...]:
-    # the course of a flight and what went wrong in it are two things
+    # check "flight" gives both a description of the flight and faults; keep them separate by grade
     return (finding.check, finding.signal, str(finding.grade) if finding.check == "flight" else "")
 
 
 def merge_findings(parts: Iterable[tuple[Finding, ...]]) -> tuple[Finding, ...]:
-    """Findings of parts: one for each check and signal, as it was in the worst part, with the stretches of all.
+    """Merge findings of parts: one for each check and signal, from the worst part, with the intervals of all parts.
 
-    A finding without a stretch is of its whole part; `evidence["parts"]` says in how many parts it was.
+    A finding without intervals concerns its whole part; `evidence["parts"]` is the number of parts with the finding.
     """
     merged: dict[tuple[str, ...], Finding] = {}
     counts: dict[tuple[str, ...], int] = {}

@@ -1,4 +1,4 @@
-"""What the commands on recordings say and where: text without control characters, JSON, progress on standard error."""
+"""Output of the commands on recordings: text without control characters, JSON, progress on standard error."""
 
 import argparse
 import json
@@ -15,23 +15,23 @@ from crazyem.errors import UsageError
 from crazyem.live.summary import check_writable, write_json
 from crazyem.recordings.finding import Finding, Grade
 
-# s until progress is shown, and between its lines where they cannot overwrite each other
+# s until progress is first shown, and between progress lines outside a terminal
 _FIRST_PROGRESS, _PROGRESS_PERIOD = 1.0, 5.0
 
 
 def plain(text: str) -> str:
-    """Text that cannot steer a terminal: names of files and signals may hold anything."""
+    """The text without control characters; names of files and signals may hold any."""
     return "".join(c if c.isprintable() or c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
 def put(text: str) -> None:
-    """A result, to standard output."""
+    """Print a result to standard output."""
     encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
     print(plain(text).encode(encoding, "replace").decode(encoding), flush=True)
 
 
 def deliver(document: Mapping[str, Any], path: str | None, text: str) -> None:
-    """A result as JSON, indented, where --json says, and as text unless standard output has the JSON.
+    """Write a result as indented JSON to `path`, if given, and print its text unless `path` is "-" (standard output).
 
     Raises: UsageError if the file cannot be written.
     """
@@ -45,27 +45,27 @@ def deliver(document: Mapping[str, Any], path: str | None, text: str) -> None:
 
 
 def complain(text: str) -> None:
-    """An error that does not end the command, to standard error."""
+    """Print an error that does not end the command to standard error."""
     sentence = plain(text).strip()
     print(f"crazyem: {sentence}{'' if sentence.endswith('.') else '.'}", file=sys.stderr, flush=True)
 
 
 def remarks(findings: Iterable[Finding]) -> list[str]:
-    """What a reader noticed and matters, a line each; the rest is the doctor's business."""
+    """A line for each finding of a reader that is not harmless; `crazyem doctor` shows the rest."""
     return [f"  {f.grade}: {f.text}" for f in findings if f.grade is not Grade.HARMLESS]
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What a command found out about one file.
+    """The result of a command for one file.
 
     Attributes:
-        file: as given or found.
+        file: path as given or found.
         data: for JSON.
         text: for people.
         error: one sentence if it failed, else "".
         code: exit code of that error, else 0.
-        detail: what the command itself needs further (pickled between processes, so keep it small).
+        detail: further data for the command itself (pickled between processes, so keep it small).
     """
 
     file: str
@@ -76,13 +76,13 @@ class Result:
     detail: Any = None
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The result for JSON."""
         failed = {"error": self.error, "exit_code": self.code} if self.error else {}
         return {"file": self.file, **self.data, **failed}
 
 
 class Report:
-    """Results as they come: text at once, JSON at the end."""
+    """Collects results: prints text at once, writes JSON at the end."""
 
     def __init__(self, arguments: argparse.Namespace) -> None:
         self.json: str | None = arguments.json
@@ -90,7 +90,7 @@ class Report:
         check_json(self.json)
 
     def add(self, result: Result) -> None:
-        """One more file."""
+        """Add the result of one more file."""
         self.results.append(result)
         if result.error:
             complain(result.error)
@@ -98,21 +98,21 @@ class Report:
             self.say(result.text)
 
     def say(self, text: str) -> None:
-        """Text for people, unless standard output is for JSON."""
+        """Print text for people, unless standard output is for JSON."""
         if text and self.json != "-":
             put(text)
 
     def close(self, **more: Any) -> int:
-        """Write the JSON, with `more` beside the files; returns the exit code: that of the first error."""
+        """Write the JSON of all files and `more`; returns the exit code of the first error, else 0."""
         if self.json:
             write_json({"files": [r.to_dict() for r in self.results], **more}, self.json)
         return next((r.code for r in self.results if r.code), 0)
 
 
 def check_json(path: str | None) -> None:
-    """Refuse a --json that cannot be written, or that would replace something else.
+    """Raise UsageError if the file of --json cannot be written, or exists and is no JSON file.
 
-    `crazyem info --json a.csv b.csv` asks for the summary of b.csv in a.csv; nobody means that.
+    Reason: `crazyem info --json a.csv b.csv` would replace the recording a.csv by the summary of b.csv.
     """
     check_writable(path)
     if path is None or path == "-":
@@ -126,7 +126,7 @@ def check_json(path: str | None) -> None:
 
 
 class Progress:
-    """How far a long command is: one line that overwrites itself on a terminal, else a line now and then."""
+    """Progress of a long command: one line that overwrites itself on a terminal, else a line every few seconds."""
 
     def __init__(self, what: str, total: int, unit: str = "files") -> None:
         self.what, self.total, self.done, self.unit = what, total, 0, unit
@@ -141,13 +141,13 @@ class Progress:
         self.clear()
 
     def step(self) -> None:
-        """One more is done."""
+        """Count one more finished item."""
         self.done += 1
         if self.total > 1:
             self.show(f"{self.what}: {self.done} of {self.total} {self.unit}")
 
     def show(self, text: str) -> None:
-        """The state in words, if it is time to say it."""
+        """Print the text if enough time has passed since the last one."""
         now = time.monotonic()
         if now < self._due:
             return
@@ -159,7 +159,7 @@ class Progress:
             print(plain(text), file=sys.stderr, flush=True)
 
     def clear(self) -> None:
-        """Take the line off the terminal, so that other text can stand there."""
+        """Remove the progress line from the terminal, to make room for other text."""
         if self._shown:
             print(f"\r{'':<78}\r", end="", file=sys.stderr, flush=True)
             self._shown = False

@@ -75,7 +75,7 @@ def _say_reused(found: Any, count: int) -> None:
 
 
 def _work(left: dict[Any, str], settings: Settings, folder: Path, arguments: argparse.Namespace) -> int | None:
-    """Run what is left; returns the exit code of the first failure, None if all is well."""
+    """Run the remaining tasks; returns the exit code of the first failure, None without failure."""
     calls = [(task, settings, str(folder.resolve()), stamp) for task, stamp in left.items()]
     code = None
     names = [task.name for task in left]
@@ -93,7 +93,7 @@ def _work(left: dict[Any, str], settings: Settings, folder: Path, arguments: arg
 
 
 def one(task: Any, settings: Settings, folder: str, stamp: str) -> Result:
-    """One simulation, its record written where the others are (in a process of its own, maybe)."""
+    """Run one simulation and write its record to the folder; may run in a worker process."""
     from crazyem.paper.runner import run_and_store
 
     run_and_store(task, settings, folder, stamp)
@@ -103,7 +103,7 @@ def one(task: Any, settings: Settings, folder: str, stamp: str) -> Result:
 def _draw(
     records: list[Any], settings: Settings, folder: Path, jobs: int | None
 ) -> tuple[list[dict[str, Any]], float, int | None]:
-    """All figures, those of one experiment and sensor in one process; the seconds; the first failure's code."""
+    """Draw all figures, one call per experiment and sensor; returns figures, seconds, exit code of a failure."""
     begin = time.perf_counter()
     groups: dict[str, list[Any]] = {}
     for record in records:
@@ -119,14 +119,14 @@ def _draw(
 
 
 def draw_group(records: list[Any], settings: Settings, folder: str, name: str) -> Result:
-    """The figures of these records (in a process of its own, maybe)."""
+    """Draw the figures of these records; may run in a worker process."""
     from crazyem.paper.figures import draw_all
 
     return Result(name, detail=draw_all(records, settings, Path(folder) / "figures"))
 
 
 def write_results(folder: Path, results: dict[str, Any]) -> None:
-    """results.json, tables.md and index.html."""
+    """Write results.json, tables.md and index.html."""
     from crazyem.atomic_file import write_file
     from crazyem.paper.pages import index_html, tables_markdown
 

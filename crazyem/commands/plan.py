@@ -1,4 +1,4 @@
-"""`crazyem plan --for mass,Ixx -o PLAN.toml`: the manoeuvre that tells most, and what to expect of it."""
+"""`crazyem plan --for mass,Ixx -o PLAN.toml`: plan the most informative manoeuvre, with its expected intervals."""
 
 import argparse
 
@@ -16,9 +16,9 @@ class NoManoeuvreError(CrazyemError):
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Plan, say what to expect, write the file.
+    """Plan, print the expected result, write the file.
 
-    Raises: NoManoeuvreError: none will do; the sentence says why, and what measurement would.
+    Raises: NoManoeuvreError: no manoeuvre reaches the goal; the message gives the reason and a measurement that does.
     """
     from crazyem.api.planning import plan
 

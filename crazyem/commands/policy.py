@@ -8,9 +8,9 @@ from crazyem.live.summary import check_writable, write_json
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Show the shipped policy with its comments, or a file's as it will be used, with what differs from the default.
+    """Show the shipped policy with its comments, or the policy of a file with its differences from the default.
 
-    Raises: UsageError: no such file. FileFormatError: it cannot be used; the sentence names the key.
+    Raises: UsageError: no such file. FileFormatError: the file cannot be used; the message names the key.
     """
     check_writable(arguments.json)
     policy = load_policy(arguments.file)

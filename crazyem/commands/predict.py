@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _ensemble(arguments: argparse.Namespace, output: Path) -> int:
-    """A band `horizon` steps ahead, by drones as the vehicle may be."""
+    """Predict a band `horizon` steps ahead, from draws of the vehicle's posterior."""
     from crazyem.api.vehicles import predict_ensemble
 
     found = predict_ensemble(
@@ -66,6 +66,6 @@ def _ensemble(arguments: argparse.Namespace, output: Path) -> int:
 
 
 def write(output: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    """All or nothing. Raises UsageError if it cannot be written."""
+    """Write the arrays; a failed write leaves no file. Raises UsageError if the file cannot be written."""
     with new_file(output, force=True) as temporary, temporary.open("wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]

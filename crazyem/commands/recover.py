@@ -1,4 +1,4 @@
-"""`crazyem recover BROKEN.mcap -o OUT.mcap`: every complete chunk of a cut or damaged MCAP file into a valid one."""
+"""`crazyem recover BROKEN.mcap -o OUT.mcap`: copy every complete chunk of a damaged MCAP file to a valid one."""
 
 import argparse
 import os

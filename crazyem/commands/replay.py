@@ -1,4 +1,4 @@
-"""`crazyem replay FILE`: the estimator of the live loop over a recording."""
+"""`crazyem replay FILE`: run the estimator of the live loop on a recording."""
 
 import argparse
 import time
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _EverySecond:
-    """A line each second, and one for each step of mass."""
+    """Prints a line each second, and a line for each step of mass."""
 
     def __init__(self) -> None:
         self._shown, self._steps = time.monotonic(), 0

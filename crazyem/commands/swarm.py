@@ -1,7 +1,7 @@
-"""`crazyem fly` and `crazyem watch` with several drones: one process, an estimator, a recording and a result each.
+"""`crazyem fly` and `crazyem watch` with several drones: one process; estimator, recording and result for each drone.
 
-A drone that cannot be reached, refuses or is lost is told about and leaves the others alone. Only where two drones
-would come too close does none of them fly.
+A failure of one drone (not reachable, refused, lost) is printed and does not affect the others. If two planned paths
+come too close, no drone flies.
 """
 
 import argparse
@@ -41,7 +41,7 @@ from crazyem.live.swarm import (
 )
 from crazyem.physics import folding
 
-CONNECTIONS_AT_ONCE, CLOSINGS_AT_ONCE = 3, 8  # connections being made and closed; more only steal each other's time
+CONNECTIONS_AT_ONCE, CLOSINGS_AT_ONCE = 3, 8  # parallel connections being opened, and closed; more would be slower
 POSITION_TIMEOUT = 10.0  # s
 RESULT_SUFFIXES = (".csv.gz", ".csv", ".mcap", ".json", ".png")
 
@@ -52,7 +52,7 @@ class Drone:
 
     Attributes:
         stack: closes its session, recording and link.
-        error: what ended it early, None if all is well. outcome: in a few words. result: of what it flew.
+        error: the error that ended the session early, or None. outcome: in a few words. result: of the flight.
     """
 
     member: Member
@@ -76,7 +76,7 @@ class Drone:
         return self.member.name
 
     def failed(self, error: BaseException) -> None:
-        """It goes no further; the first error is the one that counts."""
+        """Record an error that ends this drone's part; the first error counts."""
         self.error = self.error or error
         stopped = isinstance(error, FlightInterruptedError | MotorsCutError)
         self.outcome = "landed on request" if isinstance(error, FlightInterruptedError) else "motors cut"
@@ -138,7 +138,7 @@ def watch(arguments: argparse.Namespace) -> int:
 
 
 def _drones(arguments: argparse.Namespace, chosen: Sequence[Member]) -> list[Drone]:
-    """Everything that can be found wrong before a drone is asked."""
+    """The drones, with all checks that are possible before connecting."""
     drones = []
     for m in chosen:
         vehicle, left_out = folding.fold(folding.load(m.vehicle))
@@ -147,7 +147,7 @@ def _drones(arguments: argparse.Namespace, chosen: Sequence[Member]) -> list[Dro
             check_writable(path)
         drones.append(Drone(m, vehicle, left_out, log, plot))
     check_writable(arguments.json)
-    new_estimator(drones[0].vehicle, arguments)  # a wrong window is refused here
+    new_estimator(drones[0].vehicle, arguments)  # raises here if the window is invalid
     return drones
 
 
@@ -179,7 +179,7 @@ def _run(
                     _together(drones, work, quiet=showing)
                 finally:
                     for session in (d.session for d in drones if d.session is not None):
-                        session.stop_pushing()  # of all, before anything else ends
+                        session.stop_pushing()  # for all drones, before anything else ends
         finally:
             with concurrent.futures.ThreadPoolExecutor(CLOSINGS_AT_ONCE, thread_name_prefix="crazyem-close") as pool:
                 list(pool.map(_close, drones))
@@ -187,7 +187,7 @@ def _run(
 
 
 def _connect(drones: Sequence[Drone], begin: Callable[[Drone, Link, int], None], everyone: Interrupts) -> None:
-    """Links, recordings and sessions; a drone that cannot be reached is left behind."""
+    """Open links, recordings and sessions; a drone that cannot be reached is left out."""
 
     def reach(number: int) -> None:
         drone = drones[number]
@@ -200,7 +200,7 @@ def _connect(drones: Sequence[Drone], begin: Callable[[Drone, Link, int], None],
             say(f"{drone.name}: connected to {drone.member.uri}")
         except CrazyemError as error:
             drone.failed(error)
-        except Exception as error:  # a fault of ours with one drone must not bring down the others
+        except Exception as error:  # a program error with one drone must not end the others
             drone.failed(CrazyemError(f"connecting failed: {error!r}."))
 
     with concurrent.futures.ThreadPoolExecutor(CONNECTIONS_AT_ONCE, thread_name_prefix="crazyem-connect") as pool:
@@ -255,7 +255,7 @@ def _begin(
 
 
 def _check_separation(drones: Sequence[Drone]) -> None:
-    """Positions first, then what each will fly from there. Raises UsageError: two would come too close."""
+    """Wait for positions, then check the distances of all paths. Raises UsageError: two would come too close."""
     until = time.monotonic() + POSITION_TIMEOUT
     courses = {}
     for drone in drones:
@@ -288,7 +288,7 @@ def _watch(drone: Drone, *, duration: float | None) -> None:
 
 
 def _together(drones: Sequence[Drone], work: Callable[[Drone], None], *, quiet: Callable[[], bool]) -> None:
-    """Each in a thread of its own; returns when all have ended."""
+    """Run `work` for each drone in a separate thread; returns when all have ended."""
 
     def one(drone: Drone) -> None:
         assert drone.line is not None
@@ -309,11 +309,11 @@ def _together(drones: Sequence[Drone], work: Callable[[Drone], None], *, quiet: 
         thread.start()
     for thread in threads:
         while thread.is_alive():
-            thread.join(timeout=0.1)  # short, so that Ctrl-C is heard
+            thread.join(timeout=0.1)  # short timeout, so that Ctrl-C is handled
 
 
 def _close(drone: Drone) -> None:
-    """Session, recording, link, and the result; whatever fails with one drone."""
+    """Close session, recording and link, and make the result; an error stays with this drone."""
     try:
         with drone.stack:
             if drone.session is None or drone.estimator is None:
@@ -340,7 +340,7 @@ def _close(drone: Drone) -> None:
 
 
 def _row(drone: Drone) -> dict[str, Any]:
-    """The summary of a single flight, where there was one; its plot is drawn here."""
+    """The summary of one drone's flight, if there was one; draws its plot."""
     try:
         if drone.result is not None:
             if drone.plot is not None:
@@ -384,7 +384,7 @@ def _error(drone: Drone) -> dict[str, Any]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """A line per drone for people; what is not identifiable has a question mark."""
+    """A line per drone for people; a parameter that is not identifiable has a question mark."""
     head = (
         f"{'drone':<12} {'mass g':>15} {'Ixx':>13} {'Iyy':>13} {'Izz e-6 kg m2':>15} {'writes':>6} {'lost':>5}  outcome"
     )

@@ -1,4 +1,4 @@
-"""`crazyem vehicle convert | check | sample`: files of simulators."""
+"""`crazyem vehicle convert | check | sample`: work with simulator files."""
 
 import argparse
 from pathlib import Path
@@ -116,7 +116,7 @@ def _sample(arguments: argparse.Namespace) -> int:
 
 
 def _several(source: str, form: str | None) -> list[str]:
-    """The drones of a source, where it has names for them."""
+    """Names of the drones in a source; empty if its format has no names."""
     from crazyem.simulators.convert import read_text
     from crazyem.simulators.registry import OWN, format_named, format_of
     from crazyem.vehicle import preset_names
@@ -129,7 +129,7 @@ def _several(source: str, form: str | None) -> list[str]:
 
 
 def _target_format(arguments: argparse.Namespace, template: str | None) -> str:
-    """The format that is not named. Raises UsageError where nothing says it."""
+    """The output format from the template or the suffix. Raises UsageError if both are ambiguous."""
     from crazyem.simulators.registry import NAMES, format_of
 
     if template is not None:

@@ -1,4 +1,4 @@
-"""What a running command shows: a live view in a terminal, plain lines elsewhere, and a stream for Foxglove."""
+"""Display of a running command: a live view in a terminal, plain lines elsewhere, and a stream for Foxglove."""
 
 import argparse
 import contextlib
@@ -15,9 +15,9 @@ from crazyem.live.recorder import Recorder
 
 
 def wants_view(arguments: argparse.Namespace) -> bool:
-    """Whether a live view is to be drawn: asked for, or by default where people look at it.
+    """Whether to draw a live view: with --live, or by default if the output is a terminal.
 
-    It is drawn on standard error, so that a summary may go to a file. --confirm asks its question on plain lines.
+    The view goes to standard error, so that a summary may go to a file. --confirm needs plain lines for its question.
 
     Raises: UsageError: --live without a terminal, or with --confirm. MissingExtraError: --live without rich.
     """
@@ -42,10 +42,10 @@ def _terminal(stream: Any) -> bool:
 
 
 class SwarmInterrupts(Interrupts):
-    """Ctrl-C for all drones: a first one lands them, a second one cuts. A drone that lands already does not land twice.
+    """Ctrl-C for all drones: the first lands them, the second cuts the motors. A landing drone does not land twice.
 
     Args:
-        ones: the interrupts of each.
+        ones: the interrupts of each drone.
     """
 
     def __init__(self, ones: Sequence[Interrupts]) -> None:
@@ -59,7 +59,7 @@ class SwarmInterrupts(Interrupts):
 
 
 def landing(one: Interrupts) -> Callable[[], None]:
-    """What the key for landing does; never a cut, however often it is pressed."""
+    """The function of the landing key; repeated presses never cut the motors."""
 
     def land() -> None:
         one.count = max(one.count, 1)
@@ -68,7 +68,7 @@ def landing(one: Interrupts) -> Callable[[], None]:
 
 
 class Viewed:
-    """A running drone as the view needs it."""
+    """Observer and controls of a running drone for the view."""
 
     def __init__(self, session: Any, line: LiveLine, *, name: str, land: Callable[[], None] | None = None) -> None:
         from crazyem.live.views import Observer, SessionControls
@@ -81,10 +81,10 @@ class Viewed:
 
 @contextlib.contextmanager
 def live_view(wanted: bool, drones: Callable[[], Sequence[Viewed]]) -> Iterator[Callable[[], bool]]:
-    """The dashboard while the block runs; yields whether it is showing now (q ends it, plain lines take over).
+    """Show the dashboard during the block; yields a function: is it visible now? (q ends it, plain lines take over.)
 
     Args:
-        drones: those that run now; called in the dashboard's thread.
+        drones: returns the running drones; called in the dashboard's thread.
     """
     if not wanted:
         yield lambda: False
@@ -103,7 +103,7 @@ def live_view(wanted: bool, drones: Callable[[], Sequence[Viewed]]) -> Iterator[
 
 
 class Streams:
-    """Recorders with a stream for Foxglove beside them, if one was asked for; a context manager."""
+    """Context manager that adds a stream for Foxglove to recorders, if requested."""
 
     def __init__(self, port: int | None) -> None:
         self._port = port
@@ -122,7 +122,7 @@ class Streams:
             self._server.close()
 
     def with_stream(self, recorder: Recorder | None, name: str = "") -> Any:
-        """The recorder, with a stream of the same beside it; `name` goes before topics where drones are many."""
+        """The recorder, with a stream of the same data; `name` is the prefix of topics if there are several drones."""
         if self._server is None:
             return recorder
         from crazyem.live.foxglove import Both

@@ -1,7 +1,7 @@
-"""`crazyem watch URI`: estimates of a drone somebody else flies; commands nothing, and writes nothing unless asked.
+"""`crazyem watch URI`: estimate with a drone that another program flies; sends no commands.
 
-Only MAVLink drones can be written to here, their hover thrust, under the guard and with --push or --confirm. Without
-these the guard of such a drone runs dry: it tells what it would write.
+Only the hover thrust of MAVLink drones can be written, under the guard and with --push or --confirm. Without these
+options the guard does a dry run and only reports the values that it would write.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from crazyem.vehicle import Vehicle
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Until Ctrl-C, --duration, or the drone is gone; then the summary."""
+    """Watch until Ctrl-C, --duration or loss of the drone; then print the summary."""
     if arguments.uris or arguments.swarm:
         from crazyem.commands.swarm import watch as watch_many
 
@@ -83,7 +83,7 @@ def _open_session(
     arguments: argparse.Namespace, stack: contextlib.ExitStack, link: Link, streams: Streams, vehicle: Vehicle,
     left_out: list[str], policy: Policy,
 ) -> Session:  # fmt: skip
-    """The session of a drone that somebody else flies."""
+    """Open the session of a drone that another program flies."""
     names = ("uri", "window", "every", "rate")
     monitor = monitor_for(
         vehicle, policy.monitor, enabled=arguments.monitor, false_alarms_per_hour=arguments.false_alarms_per_hour
@@ -105,9 +105,9 @@ def _open_session(
 
 
 def write_rules(arguments: argparse.Namespace) -> WriteRules | None:
-    """Policy and mode of the guard, None where nothing is to be written or said about it.
+    """Policy and mode of the guard; None for a drone that is not MAVLink, or with --no-push.
 
-    Raises: UsageError: asked to write to a drone that only `crazyem fly` writes to; no such policy. FileFormatError.
+    Raises: UsageError: a write option for a drone to which only `crazyem fly` writes; no such policy. FileFormatError.
     """
     mavlink = arguments.uri.startswith("mavlink:")
     writes = arguments.push or arguments.confirm
@@ -115,13 +115,13 @@ def write_rules(arguments: argparse.Namespace) -> WriteRules | None:
         raise UsageError("watch writes to MAVLink drones only: use crazyem fly, or crazyem.attach in a script.")
     if not mavlink or arguments.no_push:
         return None
-    open_link(arguments.uri)  # a wrong address is refused here, before anything is compiled
+    open_link(arguments.uri)  # raises here if the address is wrong, before compiling
     confirm = confirm_in_terminal if arguments.confirm else None
     return WriteRules(load_policy(arguments.policy), dry_run=not writes, confirm=confirm)
 
 
 def _outcome(session: Session, error: BaseException | None) -> str:
-    """How it ended, for the policy: what was written is put back only on the ground."""
+    """How the session ended, for the policy: written values are restored only on the ground."""
     if session.lost is not None or isinstance(error, LinkError):
         return "link_lost"
     if error is not None:

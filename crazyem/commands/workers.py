@@ -1,7 +1,7 @@
-"""Processes of this machine that share calls of one function; however their work ends, they end first.
+"""Worker processes of this machine that share the calls of one function; they always end before the caller goes on.
 
-A process and its parent share one pipe and nothing else: no queue or semaphore that a killed process could leave
-behind, half written or locked. Modules that take long are imported by the work, not by this file.
+A process and its parent share only one pipe: a killed process could leave a queue half written or a semaphore locked.
+Slow modules are imported by the work, not by this file.
 """
 
 import contextlib
@@ -14,11 +14,11 @@ from typing import Any
 
 from crazyem.errors import CrazyemError
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # in each process; processes share the cores
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # 1 in each worker: workers share the cores
 
 
 def shared(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], count: int) -> Generator[Any, None, None]:
-    """Values of `function(*task)` from `count` processes, in the order of the tasks, as they become known.
+    """Yield the values of `function(*task)` from `count` processes, in the order of the tasks.
 
     Raises: CrazyemError (a process ended before its work was done).
     """
@@ -58,7 +58,7 @@ def shared(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], count
         with _no_interrupts():
             for process, link in zip(processes, links, strict=True):
                 if not finished:
-                    process.kill()  # work that is not wanted any more is not waited for
+                    process.kill()  # the caller needs no further results, so do not wait
                 link.close()
                 process.join()
 
@@ -66,7 +66,7 @@ def shared(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], count
 def _start(processes: list[multiprocessing.process.BaseProcess], links: list[Connection]) -> None:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    with theirs:  # in the process alone, so that its end is the end of the pipe
+    with theirs:  # closed in the parent: the pipe then ends with the worker process
         process = context.Process(target=_work, args=(theirs,), daemon=True)
         process.start()
     processes.append(process)
@@ -74,7 +74,7 @@ def _start(processes: list[multiprocessing.process.BaseProcess], links: list[Con
 
 
 def _work(link: Connection) -> None:
-    """A process: does what it is sent until nothing more can come."""
+    """Main function of a worker: run received tasks until the pipe closes."""
     for name in _THREADS:
         os.environ.setdefault(name, "1")
     with contextlib.suppress(EOFError, ConnectionError):
@@ -85,10 +85,10 @@ def _work(link: Connection) -> None:
 
 @contextlib.contextmanager
 def _no_interrupts() -> Generator[None, None, None]:
-    """Ctrl-C does nothing here, nor ever in processes started here, to which a terminal sends it too."""
+    """Ignore Ctrl-C in this block, and always in processes started here: a terminal sends Ctrl-C to them, too."""
     try:
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    except ValueError:  # not the main thread: no Ctrl-C comes here
+    except ValueError:  # not the main thread, which alone receives Ctrl-C
         yield
         return
     try:
