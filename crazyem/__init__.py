@@ -1,7 +1,7 @@
 """Firmware-in-the-loop estimation of a Crazyflie's mass and inertia, online, by expectation maximisation.
 
-What the commands do, as functions: they return results and raise `crazyem.errors.CrazyemError`; they never print or
-exit. Every name is imported on first use, so `import crazyem` is quick.
+The package offers the commands as functions. They return results and raise `crazyem.errors.CrazyemError`; they never
+print or exit. Every name is imported on first use, so that `import crazyem` is quick.
 """
 
 import importlib

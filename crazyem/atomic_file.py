@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all: written beside their place, moved there when complete."""
+"""Atomic writing of files: write a temporary file in the same folder, rename it when complete."""
 
 import contextlib
 import os
@@ -8,14 +8,14 @@ from pathlib import Path
 
 from crazyem.errors import UsageError
 
-TEMPORARY_PREFIX = ".crazyem-"  # of the name of a file that is not complete; a process that is killed leaves one behind
+TEMPORARY_PREFIX = ".crazyem-"  # of the names of incomplete files; a killed process leaves one behind
 
 
 @contextlib.contextmanager
 def new_file(path: Path, *, force: bool = False) -> Iterator[Path]:
-    """A temporary file that becomes `path` when the block ends well, and vanishes when it does not.
+    """A temporary file that is renamed to `path` at the end of the block, or deleted if the block raises.
 
-    Raises: UsageError if `path` exists and not `force`, or it cannot be written.
+    Raises: UsageError if `path` exists and not `force`, or `path` cannot be written.
     """
     try:
         if path.is_dir():
@@ -30,7 +30,7 @@ def new_file(path: Path, *, force: bool = False) -> Iterator[Path]:
     try:
         yield temporary
         with temporary.open("rb") as file:
-            os.fsync(file.fileno())  # on the disk before it takes the place of another file
+            os.fsync(file.fileno())  # on the disk before it replaces another file
         mask = os.umask(0)
         os.umask(mask)
         temporary.chmod(0o666 & ~mask)
@@ -42,6 +42,6 @@ def new_file(path: Path, *, force: bool = False) -> Iterator[Path]:
 
 
 def write_file(path: str | Path, content: str | bytes) -> None:
-    """A whole file in place of one that may exist. Raises UsageError if it cannot be written."""
+    """Write a file atomically; an existing file is replaced. Raises UsageError if it cannot be written."""
     with new_file(Path(path), force=True) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)

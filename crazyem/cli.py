@@ -11,12 +11,12 @@ from typing import Any, NoReturn
 
 from crazyem.errors import CrazyemError, UsageError
 
-_MODULES = {"import": "import_"}  # where the name of a command cannot be that of its module
-LONGEST_WINDOW = 20_000  # samples; the buffers are made at once, and an update would take seconds long before
+_MODULES = {"import": "import_"}  # commands whose module has another name, because the command is a Python keyword
+LONGEST_WINDOW = 20_000  # samples; buffers are allocated at the start, and updates take seconds even below
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one sentence, like every other error; the usage is behind --help."""
+    """Parser that reports an error in one sentence, like all other errors; --help shows the usage."""
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message} (see {self.prog} --help).")
@@ -52,7 +52,7 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def common(name: str, text: str, *, recorded: bool = False) -> argparse.ArgumentParser:
-        # A replay without options repeats the flight with what the recording says it was flown with.
+        # A replay without options takes vehicle, window and update interval from the recording.
         vehicle, window, every = (None, None, None) if recorded else ("cf2", 800, 4)
         p = commands.add_parser(name, help=text, description=text)
         p.add_argument("--vehicle", default=vehicle, metavar="NAME|FILE", help="preset or vehicle file (default: cf2)")
@@ -102,7 +102,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _flying(p: argparse.ArgumentParser) -> None:
-    """What is flown."""
+    """Options for the trajectory of a flight."""
     p.add_argument(
         "--trajectory", nargs="+", default=["hover"], metavar="NAME",
         help="hover, figure8, excite, informative, waypoints FILE, or plan FILE",
@@ -116,7 +116,7 @@ def _flying(p: argparse.ArgumentParser) -> None:
 
 
 def _pushing(p: argparse.ArgumentParser, push: str) -> None:
-    """Whether the guard may write."""
+    """Options for the writes of the guard."""
     pushing = p.add_mutually_exclusive_group()
     pushing.add_argument("--push", action="store_true", help=push)
     pushing.add_argument("--confirm", action="store_true", help="write, but ask before the first time")
@@ -126,14 +126,14 @@ def _pushing(p: argparse.ArgumentParser, push: str) -> None:
 
 
 def _monitor(p: argparse.ArgumentParser, default: bool | None) -> None:
-    """Faults in flight."""
+    """Options of the monitor for faults in flight."""
     text = f"look for faults in flight (default: {'off' if default is False else 'as the policy says'})"
     p.add_argument("--monitor", action=argparse.BooleanOptionalAction, default=default, help=text)
     p.add_argument("--false-alarms-per-hour", type=_number(1e-6, 1000), metavar="N", help="of the monitor")
 
 
 def _logging(p: argparse.ArgumentParser, *, reconnect: float) -> None:
-    """What a session asks of its link."""
+    """Options of a session's link."""
     hertz, seconds = _number(1, 1000, " Hz"), _number(0, 3600, " seconds")
     p.add_argument(
         "--rate", type=hertz, default=1000.0 / 11.0, metavar="HZ",
@@ -146,7 +146,7 @@ def _logging(p: argparse.ArgumentParser, *, reconnect: float) -> None:
 
 
 def _many(p: argparse.ArgumentParser) -> None:
-    """Several drones, and how they are shown."""
+    """Options for several drones, and for their display."""
     p.add_argument("--uri", action="append", default=[], dest="uris", metavar="URI", help="one more drone (repeatable)")
     p.add_argument("--swarm", metavar="FILE.toml", help="drones with uri, vehicle, trajectory and offset each")
     shown = p.add_mutually_exclusive_group()
@@ -159,7 +159,7 @@ def _many(p: argparse.ArgumentParser) -> None:
 
 
 def _links(commands: Any) -> None:
-    """What there is to fly and watch."""
+    """The commands for links to drones."""
     text = "what a drone could be reached through here: radio, USB, UDP, serial; and what is missing"
     p = commands.add_parser("links", help=text, description=text)
     p.add_argument("--host", default="127.0.0.1", metavar="HOST", help="asked for drones on UDP (default: this one)")
@@ -171,7 +171,7 @@ def _links(commands: Any) -> None:
 
 
 def _policy(commands: Any) -> None:
-    """The rules of the guard."""
+    """The command for the rules of the guard."""
     text = "the rules of the guard on writes to a drone: the shipped ones, or a file's, checked"
     p = commands.add_parser("policy", help=text, description=text)
     p.add_argument("file", nargs="?", metavar="FILE.toml", help="a policy file (default: the shipped policy)")
@@ -179,7 +179,7 @@ def _policy(commands: Any) -> None:
 
 
 def _paper(commands: Any) -> None:
-    """Zhao's paper, made again."""
+    """The command that reproduces Zhao's paper."""
     text = "the paper's simulations again: its method, ours and the information limit, as tables and figures"
     p = commands.add_parser("paper", help=text, description=text)
     p.add_argument("--experiment", choices=("all", "table1", "offline", "online"), default="all")
@@ -201,7 +201,7 @@ def _paper(commands: Any) -> None:
 
 
 def _reading(p: argparse.ArgumentParser) -> None:
-    """What a reader may have to be told (`crazyem.recordings.contents`)."""
+    """Options for the reader of a recording (`crazyem.recordings.contents`)."""
     p.add_argument("--map", metavar="FILE.toml", help="which columns of a CSV are which signals: a file or a preset")
     p.add_argument(
         "--motor",
@@ -214,7 +214,7 @@ def _reading(p: argparse.ArgumentParser) -> None:
 
 
 def _cutting(p: argparse.ArgumentParser) -> None:
-    """Which part of a recording is used (`crazyem.recordings.cut`)."""
+    """Options for the part of a recording to use (`crazyem.recordings.cut`)."""
     seconds = _number(-1e12, 1e12, " seconds")
     text = "only from this time on, in seconds as info and doctor show them"
     p.add_argument("--from", dest="start", type=seconds, metavar="S", help=text)
@@ -222,7 +222,7 @@ def _cutting(p: argparse.ArgumentParser) -> None:
 
 
 def _diagnose(commands: Any) -> None:
-    """Where simulation and flight part."""
+    """The command `diagnose`."""
     text = "where a vehicle's model and its flights part, which physics was left out, and the model with it"
     p = commands.add_parser("diagnose", help=text, description=text)
     p.add_argument("files", nargs="+", metavar="RECORDING", help="flights of one drone")
@@ -248,7 +248,7 @@ def _diagnose(commands: Any) -> None:
 
 
 def _plan(commands: Any) -> None:
-    """Experiments."""
+    """The command `plan` for experiments."""
     text = "the manoeuvre that most narrows intervals, or best tells two explanations apart; and what to expect of it"
     p = commands.add_parser("plan", help=text, description=text)
     goal = p.add_mutually_exclusive_group()
@@ -273,7 +273,7 @@ def _plan(commands: Any) -> None:
 
 
 def _predict(commands: Any) -> None:
-    """Open loop, for anyone's own metric."""
+    """The command `predict`: open-loop predictions for the user's own metric."""
     text = "where a vehicle goes by its model: open-loop predictions from every recorded state, by recorded inputs"
     p = commands.add_parser("predict", help=text, description=text)
     p.add_argument("file", metavar="RECORDING", help="a recording of any known format")
@@ -300,7 +300,7 @@ def _predict(commands: Any) -> None:
 
 
 def _vehicle(commands: Any) -> None:
-    """Files of simulators."""
+    """The command `vehicle` for simulator files."""
     text = "vehicle files and those of simulators: converted, checked by flights, sampled"
     actions = commands.add_parser("vehicle", help=text, description=text).add_subparsers(
         dest="action", required=True, metavar="ACTION"
@@ -358,7 +358,7 @@ def _vehicle(commands: Any) -> None:
 
 
 def _on_recordings(commands: Any) -> None:
-    """The commands that work on files and need neither drone nor estimator."""
+    """The commands on files that need neither drone nor estimator."""
 
     def command(name: str, text: str, *, many: bool = True) -> argparse.ArgumentParser:
         p: argparse.ArgumentParser = commands.add_parser(name, help=text, description=text)
@@ -421,10 +421,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         # In `fly --trajectory hover URI` the option has swallowed the URI.
         if arguments.command == "fly" and arguments.uri is None and "://" in arguments.trajectory[-1]:
             arguments.uri = arguments.trajectory.pop()
-        # Imported only now: `crazyem --help` should not wait for numba. The name is one of the parser's own.
+        # Imported late, so that `crazyem --help` need not wait for numba. The parser allows only known names.
         module = _MODULES.get(arguments.command, arguments.command)
         code = int(importlib.import_module(f"crazyem.commands.{module}").run(arguments))
-        sys.stdout.flush()  # here, where a reader that has gone away can still be dealt with
+        sys.stdout.flush()  # here, so that a closed pipe raises inside this try block
         return code
     except CrazyemError as error:
         sentence = str(error)
@@ -434,6 +434,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("crazyem: interrupted.", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        # `| head` has seen enough; the interpreter must not complain about it when it flushes at its end
+        # the reader has closed the pipe (`| head`); avoid a second error when the interpreter flushes at its end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141

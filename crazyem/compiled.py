@@ -1,12 +1,12 @@
-"""`compiled`: numba's njit with a disk cache, and one machine code for all processes: same input, same bits.
+"""`compiled`: numba's njit with a disk cache and the same machine code in all processes: same input, same bits.
 
-A kernel's library holds a copy of every kernel that it calls. LLVM leaves these copies as weak symbols: where another
-library of the process has a function of the same name, the linker calls that one instead, and both are optimised
-differently. Numbers would then differ in the last bit by which kernel a process compiled or loaded first. Here a
-library keeps its copies to itself. Compiling is deterministic, so code compiled now is the code loaded later.
+A kernel's library holds a copy of every kernel that it calls. LLVM leaves these copies as weak symbols. If another
+library of the process has a function of the same name, the linker may call that function, which is optimised
+differently. The last bit of results would then depend on the order in which kernels are compiled or loaded. Here the
+copies of a library are private. Compiling is deterministic, so compiled and loaded code are equal.
 
-Numba stamps a cached function with the content of its own file; a kernel that calls kernels or reads layout constants
-of another file would go on running old machine code after an edit there. `compiled` notices an edit in any kernel.
+Numba stamps a cached function with its own file only. A kernel that calls kernels or reads layout constants of another
+file would keep old machine code after an edit of that file. `compiled` notices an edit of any kernel.
 """
 
 import contextlib
@@ -27,10 +27,10 @@ _KERNELS: list[Any] = []
 
 
 class _SeparateLibrary(JITCodeLibrary):
-    """Machine code in which calls between kernels are bound: other kernels may link its bitcode, not its symbols."""
+    """Machine code with private copies of the called kernels: other kernels may link its bitcode, not its symbols."""
 
     def _finalize_final_module(self) -> None:
-        linkable = self._final_module.clone()  # as numba makes it when another kernel wants to inline this one
+        linkable = self._final_module.clone()  # numba makes this copy, too, when another kernel inlines this one
         _relink(linkable, "external", "linkonce_odr")
         self._shared_module = linkable
         _relink(self._final_module, "linkonce_odr", "internal")
@@ -53,12 +53,12 @@ class _Compiler(CompilerBase):  # numba's way to customise compilation
 def kernel(function: Callable[..., Any], stamp: object = None, **options: Any) -> Any:
     """Compile `function` (explicit loops over arrays): cached on disk, without the interpreter lock.
 
-    `stamp`: what the cache is compared by (picklable); None is numba's own, the content of the function's file.
+    `stamp`: the cache is valid while this value is equal (picklable); None is numba's stamp of the function's file.
     `options`: of `numba.njit`. A division by zero gives inf or NaN, as in numpy and C.
     """
     dispatcher: Any = njit(cache=True, nogil=True, error_model="numpy", pipeline_class=_Compiler, **options)(function)
     _KERNELS.append(dispatcher)
-    with contextlib.suppress(AttributeError):  # private to numba; without it caching works, only less watchful
+    with contextlib.suppress(AttributeError):  # private names of numba; without them the cache works, but misses edits
         cache = dispatcher._cache
         if stamp is not None:
             cache._cache_file._source_stamp = stamp
@@ -67,7 +67,7 @@ def kernel(function: Callable[..., Any], stamp: object = None, **options: Any) -
 
 
 def _alone(save: Callable[..., None], index: Path) -> Callable[..., None]:
-    """`save`, one process at a time: it reads the index of a kernel's signatures and writes the index with one more."""
+    """`save` under a lock, because it reads the index of a kernel's signatures and writes it with one more entry."""
 
     def save_alone(key: Any, data: Any) -> None:
         with _locked(index.with_suffix(".lock")):
@@ -87,7 +87,7 @@ def _locked(path: Path) -> Iterator[None]:
 
 
 def compilations() -> int:
-    """How many kernels this process has compiled, because the disk did not have them."""
+    """Number of kernels that this process has compiled because they were not in the disk cache."""
     stats = (k.stats for k in _KERNELS if hasattr(k, "stats"))
     return sum(sum(s.cache_misses.values()) for s in stats)
 
@@ -95,7 +95,7 @@ def compilations() -> int:
 FASTMATH = {"contract", "reassoc", "nsz"}  # lets dot products use vector registers; NaN keeps its meaning
 
 _ROOT = Path(__file__).parent
-# Folders with kernels, and the folders whose kernels those call: an edit in any of these calls for compiling again.
+# Folders with kernels, and the folders of the kernels that they call: an edit in these requires a new compilation.
 _CALLS = {
     "physics": ("physics",),
     "estimation": ("physics", "estimation"),
@@ -108,7 +108,7 @@ _CALLS = {
 
 
 def _has_kernels(path: Path) -> bool:
-    """Whether an edit there can change a kernel: it defines some, or the indices that they read."""
+    """Whether an edit of this file can change a kernel: it defines kernels, or the indices that kernels read."""
     return path.name == "layout.py" or "@compiled" in path.read_text(encoding="utf-8")
 
 
@@ -123,10 +123,10 @@ _STAMPS = {folder: _stamp(called) for folder, called in _CALLS.items()}
 def compiled(function: Callable[..., Any]) -> Any:
     """Compile `function` (explicit loops over arrays): cached on disk, without the interpreter lock.
 
-    A division by zero gives inf or NaN, as in numpy, and callers check what comes out; raising instead would put a
-    branch at every division and cost a third of an update.
+    A division by zero gives inf or NaN, as in numpy, and callers check the results. Raising would put a branch at
+    every division and cost a third of an update.
     """
     path = Path(function.__code__.co_filename)
     folder = path.relative_to(_ROOT).parts[0] if path.is_relative_to(_ROOT) else ""
-    # a kernel elsewhere uses its own file only, which numba checks itself
+    # a kernel of another folder uses only its own file, which numba checks
     return kernel(function, stamp=_STAMPS.get(folder), fastmath=FASTMATH)

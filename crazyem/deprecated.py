@@ -1,4 +1,4 @@
-"""Old names that keep working for one release: each use gives a DeprecationWarning that says the new name."""
+"""Old names that work for one more release: each use gives a DeprecationWarning with the new name."""
 
 import importlib
 import warnings
@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 
 def warn(old: str, new: str, *, level: int = 2) -> None:
-    """Say that `old` is deprecated and `new` takes its place.
+    """Warn that `old` is deprecated and `new` replaces it.
 
     Args:
         old, new: names as a user writes them.

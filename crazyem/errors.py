@@ -1,4 +1,4 @@
-"""Errors a user can cause: one family, one-sentence messages, an exit code each; the command line prints and exits."""
+"""Errors that a user can cause: one base class, one-sentence messages, an exit code each."""
 
 
 class CrazyemError(Exception):
@@ -14,22 +14,22 @@ class UsageError(CrazyemError):
 
 
 class FileFormatError(CrazyemError):
-    """A vehicle, scenario, mapping or recording file that cannot be used; names the file and the key or place."""
+    """A vehicle, scenario, mapping or recording file cannot be used; the message names file and key or place."""
 
     exit_code = 3
 
 
 class KnownFileError(FileFormatError):
-    """A file that is known not to be a recording, but to stand for one: what it is and what to do."""
+    """A file that is a known placeholder of a recording; the message says what the file is and what to do."""
 
 
 class LinkError(CrazyemError):
-    """No drone, a drone lost, a reply that never came."""
+    """No drone, a lost drone, or a missing reply."""
 
     exit_code = 4
 
 
 class DataError(CrazyemError):
-    """Signals that cannot be estimated from: NaN, wrong units, nothing flown."""
+    """Signals that are unusable for an estimate: NaN, wrong units, no flight."""
 
     exit_code = 5

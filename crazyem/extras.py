@@ -1,4 +1,4 @@
-"""Optional dependencies: which extra of the package installs a module, and one sentence where the module is missing."""
+"""Optional dependencies: the extra of the package that installs a module, and the error if the module is missing."""
 
 import importlib
 import importlib.util
@@ -18,7 +18,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 
 
 class MissingExtraError(UsageError):
-    """A library is not installed that an optional part of the package needs; the message has the pip line."""
+    """A library for an optional part of the package is not installed; the message has the pip command."""
 
 
 def installed(module: str) -> bool:
@@ -31,7 +31,7 @@ def require(module: str, purpose: str) -> ModuleType:
 
     Args:
         module: dotted name, such as "matplotlib.figure".
-        purpose: what needs the library, as the beginning of a sentence: "A plot".
+        purpose: use of the library, as the subject of a sentence: "A plot".
 
     Raises:
         MissingExtraError: the library is not installed.
@@ -42,7 +42,7 @@ def require(module: str, purpose: str) -> ModuleType:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != top:
-            raise  # the library is there, and lacks something of its own
+            raise  # the library is installed, but one of its own dependencies is missing
         raise MissingExtraError(
             f"{purpose} needs {top}, which is not installed: pip install 'crazyem[{extra}]'."
         ) from None

@@ -1,4 +1,4 @@
-"""How results show themselves in a notebook: HTML tables of escaped text, and figures of matplotlib."""
+"""Display of results in a notebook: HTML tables of escaped text, and figures of matplotlib."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -50,7 +50,7 @@ def saved(figure: "Figure", path: str | Path | None) -> "Figure":
 
 
 def finite(value: Any) -> Any:
-    """The same for JSON, which knows no NaN and no infinity: they become None; tuples become lists."""
+    """The value for JSON, which has no NaN and no infinity: these become None; tuples become lists."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""TOML files of users: read within a limit and parsed, each fault one sentence that names the file; and written."""
+"""Read users' TOML files with a size limit, and write TOML. Each error is one sentence that names the file."""
 
 import math
 import re
@@ -25,10 +25,10 @@ def parse_toml(source: str, *, where: str) -> dict[str, Any]:
 
 
 def read_text(path: str | Path, *, what: str, largest: int = LARGEST_TOML_FILE) -> str:
-    """The text of a small file of the user's.
+    """The text of a small file of the user.
 
     Args:
-        what: what the file should be, for sentences: "vehicle file".
+        what: kind of the file, for messages: "vehicle file".
         largest: bytes.
 
     Raises:
@@ -54,7 +54,7 @@ def read_toml(path: str | Path, *, what: str, largest: int = LARGEST_TOML_FILE) 
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Whether a value of a file is a number other than NaN; true and false are none."""
+    """Whether a value of a file is a number other than NaN; true and false are not numbers."""
     return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
 
 
@@ -63,7 +63,7 @@ def toml_text(table: Mapping[str, Any], *, name: str = "") -> str:
 
     Args:
         table: text, numbers, true and false, lists of them, and further tables.
-        name: of the table, for its headline.
+        name: of the table, for its header.
     """
     lines = [
         f"{toml_key(key)} = {toml_value(value)}"

@@ -12,15 +12,15 @@ File format (all SI; `presets/*.toml` are examples):
     motor_time_constant = 0.05        # s, first-order lag of rotor thrust
     thrust_max = 0.12                 # N per rotor
     battery_compensated = true        # the firmware compensates the battery voltage
-    mass_sd = 0.5                     # optional: how sure the file is of a value, standard deviation over the value
+    mass_sd = 0.5                     # optional: uncertainty of the value, standard deviation over the value
     inertia_sd = [0.5, 0.5, 0.7]      # optional: of Ixx, Iyy, Izz (one number for all three, or three)
     motor_time_constant_sd = 0.7      # optional
     [effects.NAME]                    # fitted effects, parameter = value
-    [days]                            # optional: how the drone differs from day to day, by healthy flights
-    flights = 5                       # that many
+    [days]                            # optional: day-to-day variation of the drone, from healthy flights
+    flights = 5                       # number of these flights
     thrust_sd = 0.01                  # of the thrust, relative
     trim_sd = [2e-4, 2e-4, 1e-4]      # of the trim (effects.trim), m
-    [posterior]                       # optional, of a fitted file: how sure it is of these together
+    [posterior]                       # optional, in a fitted file: joint posterior of these parameters
     parameters = ["inertia.xx", ...]  # effect.parameter
     mean = [...]
     covariance = [[...], ...]
@@ -37,16 +37,16 @@ from crazyem.errors import FileFormatError, UsageError
 from crazyem.toml_file import is_number, parse_toml, read_text, toml_text
 
 GRAVITY = 9.81  # m/s^2, as the firmware has it
-LARGEST_SPREAD = 3.0  # standard deviation of a logarithm beyond which a prior says nothing
+LARGEST_SPREAD = 3.0  # largest standard deviation of a parameter's logarithm; a wider prior gives no information
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """How sure a fit is of parameters of effects together.
+    """Joint posterior of the fitted parameters of effects.
 
     Attributes:
         parameters: (k,) "effect.parameter".
-        mean: (k,) of each, in its unit.
+        mean: (k,) of each parameter, in its unit.
         covariance: (k, k).
     """
 
@@ -57,10 +57,10 @@ class Posterior:
 
 @dataclass(frozen=True)
 class Days:
-    """How a drone differs from one day to the next, standard deviations.
+    """Day-to-day variation of a drone, as standard deviations.
 
     Attributes:
-        flights: number of healthy flights that say so.
+        flights: number of healthy flights from which the variation is computed.
         thrust_sd: of the thrust, relative.
         trim_sd: of torque over thrust about x, y, z [m].
     """
@@ -75,7 +75,7 @@ class Vehicle:
     """Nominal constants of one drone (SI). A vehicle without rotor data takes thrust and torque as its inputs.
 
     Attributes:
-        name: what it is called.
+        name: of the drone.
         mass: kg.
         inertia: Ixx, Iyy, Izz [kg m^2] about the body axes (x forward, y left, z up).
         inertia_products: Ixy, Ixz, Iyz [kg m^2], elements of the inertia matrix.
@@ -88,9 +88,9 @@ class Vehicle:
         battery_compensated: whether the firmware scales commands by battery voltage.
         effects: fitted effects, name -> parameter -> value.
         mass_sd, inertia_sd, motor_time_constant_sd: standard deviation of the value over the value, the estimator's
-            prior; None where the file does not say (estimation/model.py has what stands then).
-        posterior: of a fitted vehicle, how sure the fit is of its effects.
-        days: how the drone differs from day to day; None: not known.
+            prior; None if the file has none (estimation/model.py has the defaults).
+        posterior: joint posterior of the effects of a fitted vehicle, or None.
+        days: day-to-day variation of the drone; None: unknown.
     """
 
     name: str
@@ -147,7 +147,7 @@ def load_vehicle(name_or_path: str | Path) -> Vehicle:
 
 
 def parse_vehicle(source: str, *, where: str = "vehicle") -> Vehicle:
-    """Vehicle from the text of a vehicle file; `where` names it in errors (FileFormatError)."""
+    """Vehicle from the text of a vehicle file; `where` names the text in errors (FileFormatError)."""
     data = parse_toml(source, where=where)
     known = {
         "name", "mass", "inertia", "arm", "thrust_curve", "rotor_constant", "torque_per_thrust",
@@ -230,7 +230,7 @@ def _posterior(data: Any, where: str) -> Posterior:
 
 
 def _spread(data: Mapping[str, Any], key: str, where: str, count: int) -> Any:
-    """One number, or `count` of them (one in the file stands for all), each in (0, 3]; None if the key is not there."""
+    """One number, or `count` numbers (one in the file stands for all), each in (0, 3]; None if the key is missing."""
     if key not in data:
         return None
     values = _numbers(data, key, where, lengths=sorted({1, count}))
