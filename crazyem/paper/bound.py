@@ -1,14 +1,14 @@
-"""The Cramer-Rao bound of mass and inertia for a stretch of a paper flight, found without the product's estimator.
+"""The Cramer-Rao bound of mass and inertia for a part of a paper flight, computed without the product's estimator.
 
-A Kalman filter of its own, in Euler angles and with the explicit Euler step of eq. 56, runs along the flight with the
-true parameters. The innovations e_k and their covariances S_k are differentiated by central differences in the
-logarithms of all parameters (mass, inertia, noise scales). The information is
+A separate Kalman filter, in Euler angles and with the explicit Euler step of eq. 56, runs along the flight with the
+true parameters. Central differences give the derivatives of the innovations e_k and their covariances S_k with respect
+to the logarithms of all parameters (mass, inertia, noise scales). The information is
 
     I_ij = sum_k  de_k/di' S_k^-1 de_k/dj  +  1/2 tr(S_k^-1 dS_k/di S_k^-1 dS_k/dj)
 
-(expected, given the flight; the first sum is what the course of the innovations says, the second what their size says).
-Noise acts through thrust and torque only (rank 4, eq. 55). Noise scales that are not known are parameters too, and the
-bound of mass and inertia is that of the whole matrix inverted.
+(expected, given the flight; the first term is the information in the innovations, the second in their covariance).
+Noise acts through thrust and torque only (rank 4, eq. 55). Unknown noise scales are parameters, too; the bound of mass
+and inertia comes from the inverse of the whole matrix.
 """
 
 from dataclasses import dataclass
@@ -30,14 +30,14 @@ MEASURED = {
     "C": ("position", "velocity", "body_rate"),
 }
 NOISE_CASES = ("free", "common", "single", "known")
-# m, m/s, rad, rad/s around the true state at the start: little beside what half a second of data says (wider, the bound
-# of mass grows by 0.5 % at most), but narrow enough that the filter is linear there. From 0.3 rad of attitude its own
-# start biases the score of mass by 0.3 of the bound (sensor A).
+# m, m/s, rad, rad/s around the true state at the start. Wide enough to add little information to half a second of data
+# (a wider start raises the bound of mass by 0.5 % at most), narrow enough that the filter is linear. From 0.3 rad of
+# attitude on, the start biases the score of mass by 0.3 of the bound (sensor A).
 START_SD = np.repeat([0.05, 0.1, 0.03, 1.0], 3)
-# Of a logarithm, for the central differences. With steps ten times shorter the bound of sensor A differs by 2e-5 of
-# itself from one processor to another (rounding), with this one by 3e-7; its curvature costs 2e-7.
+# Step in the logarithm of a parameter for central differences. Rounding changes the bound of sensor A by a relative
+# 3e-7 between processors, with ten times shorter steps by 2e-5. The truncation error of this step is 2e-7.
 DERIVATIVE_STEP = 1e-3
-CHUNK_ROWS = 400  # rows at a time, so that memory does not grow with the flight
+CHUNK_ROWS = 400  # rows per call, so that memory does not grow with the flight
 
 
 @compiled
@@ -82,7 +82,7 @@ def _slopes(x, specific, inertia, a):
 
 @compiled
 def _propagate(a, dt, p, out):
-    """out = ((1 + dt A) p)', for A of `_slopes` and p (12, 12); twice, it is the prediction of a covariance."""
+    """out = ((1 + dt A) p)', for A of `_slopes` and p (12, 12); applied twice, this predicts a covariance."""
     for m in range(12):
         for i in range(3):
             v = 0.0
@@ -100,7 +100,7 @@ def _propagate(a, dt, p, out):
 
 @compiled
 def _update(y, x, p, sensor_sd, before, gain, error, row):
-    """Measure y (12 of it) and fill its innovation and covariance; before, gain (12,) are scratch."""
+    """Update with the 12 state measurements of y; fill innovation and covariance. before, gain (12,) are scratch."""
     for i in range(12):
         before[i] = x[i]
         if np.isnan(y[i]):
@@ -110,7 +110,7 @@ def _update(y, x, p, sensor_sd, before, gain, error, row):
             if not np.isnan(y[j]):
                 row[i, j] = p[i, j]
         row[i, i] += sensor_sd[i // 3] ** 2
-    for i in range(12):  # one scalar after the other: the same as all at once, and nothing is inverted
+    for i in range(12):  # scalar updates: same result as a joint update, without an inversion
         if np.isnan(y[i]):
             continue
         variance = p[i, i] + sensor_sd[i // 3] ** 2
@@ -130,16 +130,16 @@ def innovations(begin, end, y, wrench, x, p, dt, mass, inertia, process, sensor_
 
     Args:
         begin, end: rows; only row 0 has no step before it.
-        y: (n, 15) position m, velocity m/s, angles rad, rate rad/s, mean specific force m/s^2 (body) of the step that
-            ended; NaN is not measured.
+        y: (n, 15) position m, velocity m/s, angles rad, rate rad/s, mean specific force m/s^2 (body) over the previous
+            step; NaN means not measured.
         wrench: (n, 4) N, N m held from each row on.
-        x, p: (12,), (12, 12) state and covariance before row `begin`; left as they are after row end - 1.
+        x, p: (12,), (12, 12) state and covariance before row `begin`; on return, those after row end - 1.
         dt: s.
         mass, inertia: kg, (3,) kg m^2.
         process: (4,) intensities of thrust N sqrt(s) and torque N m sqrt(s).
         sensor_sd: (5,) standard deviations of the five groups of y.
-        e, s: (end - begin, 15), (end - begin, 15, 15); the specific force comes first, the state's innovations are
-            given it. Not measured is 0 with a variance of 1, whatever the parameters.
+        e, s: (end - begin, 15), (end - begin, 15, 15) are filled; the specific force is processed first, the other
+            innovations are conditional on it. Entries without measurement are 0 with variance 1.
     """
     a = np.empty((4, 3, 3))
     tmp = np.empty((12, 12))
@@ -163,7 +163,7 @@ def innovations(begin, end, y, wrench, x, p, dt, mass, inertia, process, sensor_
                 row[12 + i, 12 + i] = sensor_sd[4] ** 2
                 error[12 + i] = y[k, 12 + i]
                 if i == 2:
-                    # it sees the very disturbance that moves the drone in this step: the state's noise given it
+                    # the accelerometer measures the disturbance of this step: condition the process noise on it
                     row[14, 14] += scatter
                     error[14] -= thrust / mass
                     share = scatter / row[14, 14]
@@ -185,7 +185,7 @@ def innovations(begin, end, y, wrench, x, p, dt, mass, inertia, process, sensor_
 
 @dataclass(frozen=True)
 class Bound:
-    """What can be known of mass and inertia from one stretch of flight.
+    """The Cramer-Rao bound of mass and inertia from one part of a flight.
 
     Attributes:
         names: (p) parameters; the logarithm of each is the coordinate. The first four are mass, Ixx, Iyy, Izz.
@@ -211,21 +211,21 @@ class Bound:
 
     @property
     def efficient(self) -> NDArray:
-        """(4,) relative error that an efficient estimator makes on this very stretch (first order): I^-1 score.
+        """(4,) relative error of an efficient estimator on this part of the flight, to first order: I^-1 score.
 
-        Its standard deviation over flights is `sd`. The error of an estimator minus this is what it wastes.
+        Its standard deviation over flights is `sd`. An estimator's error minus this error is avoidable.
         """
         return (self.covariance @ self.score)[:4]
 
     def under(self, noise: str, *, sensors: str = "free") -> "Bound":
-        """The bound if more were known of the noise; from a bound with everything free, at no cost.
+        """The bound with more knowledge of the noise, computed from a bound with all noise scales free.
 
         Args:
-            noise: free, common (one intensity for the three torques), single (one number for thrust and torques: their
+            noise: free, common (one intensity for the three torques), single (one factor for thrust and torques: their
                 ratio is known) or known.
             sensors: free or known: standard deviations of the measurements.
 
-        Raises: UsageError: there is no such option, or this bound lacks the scales.
+        Raises: UsageError: no such option, or this bound does not contain these noise scales.
         """
         if noise not in NOISE_CASES:
             raise UsageError(f"unknown noise '{noise}' (known: {', '.join(NOISE_CASES)})")
@@ -247,9 +247,9 @@ class Bound:
 
 
 def observed(flight: Flight, sensor: str, first: int, last: int, *, accelerometer: bool = True) -> NDArray:
-    """(last - first, 15) what sensor A, B or C read in these rows, NaN for what it does not read.
+    """(last - first, 15) readings of sensor A, B or C in these rows, NaN for quantities that it does not measure.
 
-    Raises: UsageError: there is no such sensor, or the flight has no such rows.
+    Raises: UsageError: no such sensor, or the flight has no such rows.
     """
     if sensor not in MEASURED:
         raise UsageError(f"unknown sensor '{sensor}' (known: {', '.join(MEASURED)})")
@@ -261,20 +261,20 @@ def observed(flight: Flight, sensor: str, first: int, last: int, *, acceleromete
             at = slice(3 * group, 3 * group + 3)
             source = slice(15, 18) if name == "specific_force" else at
             y[:, at] = flight.readings[first:last, source]
-    y[0, 12:] = np.nan  # of the step before the stretch
+    y[0, 12:] = np.nan  # this belongs to the step before the first row
     return y
 
 
 def _add(seen: NDArray, e: NDArray, cov: NDArray, step: float, information: NDArray, score: NDArray) -> None:
-    """Add what some rows say to the information (p, p) and the score (p,), both filled in place.
+    """Add the contributions of some rows to the information (p, p) and the score (p,), in place.
 
     Args:
-        seen: (m,) columns that are measured at all.
-        e, cov: (2 p + 1, n, 15), (2 p + 1, n, 15, 15) of the truth, then a step up and one down for each parameter.
-        step: of the logarithms.
+        seen: (m,) measured columns.
+        e, cov: (2 p + 1, n, 15), (2 p + 1, n, 15, 15) at the truth, then a step up and a step down for each parameter.
+        step: in the logarithms.
     """
     e, cov = e[:, :, seen], cov[:, :, seen[:, None], seen]
-    white = np.linalg.inv(np.linalg.cholesky(cov[0]))  # it whitens: the sums become plain products
+    white = np.linalg.inv(np.linalg.cholesky(cov[0]))  # whitening matrix: the sums become plain products
     error = (white @ e[0, ..., None])[..., 0]
     slope = (white @ ((e[1::2] - e[2::2]) / (2.0 * step))[..., None])[..., 0]
     spread = white @ ((cov[1::2] - cov[2::2]) / (2.0 * step)) @ white.transpose(0, 2, 1)
@@ -297,11 +297,11 @@ def bound(
     """Cramer-Rao bound of mass and inertia from rows first..last-1 of a flight.
 
     Args:
-        flight: any; its true state is used as the centre of the start only, its true parameters throughout.
+        flight: any; its true state is only the centre of the start, its true parameters are used throughout.
         sensor: A, B or C.
-        first, last: rows; last defaults to all that is known.
-        noise, sensors: what is known of the noise, see `Bound.under`.
-        accelerometer: whether sensor A reads the specific force, too.
+        first, last: rows; last defaults to all rows flown.
+        noise, sensors: knowledge of the noise, see `Bound.under`.
+        accelerometer: whether sensor A also measures the specific force.
 
     Raises: UsageError: no such sensor, rows or option.
     """

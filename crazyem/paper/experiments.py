@@ -1,7 +1,7 @@
-"""The paper's simulations as tasks, one each per experiment, sensor, method and seed; a task is a function of its name.
+"""The paper's simulations as tasks, one per experiment, sensor, method and seed; the name determines the result.
 
-A record is what JSON can hold: SI, numbers rounded to seven digits, null for what is no number. `timing` is kept apart,
-so that everything else can be compared bit by bit.
+A record is JSON data: SI units, numbers rounded to seven digits, null for NaN and infinity. `timing` is a separate
+entry, so that all other entries can be compared bit by bit.
 """
 
 import math
@@ -23,8 +23,8 @@ from crazyem.paper.settings import Settings
 SETTLED_SECONDS = 8.0  # s: windows of an online flight that begin later count as converged
 OFFLINE_ITERATIONS = 20  # of EM, offline
 PATH_POINTS = 200
-_DENSE, _EVERY = 50, 10  # intervals over time: the first so many updates, then every so many-th
-_CRASH_CHECK_PERIOD = 25  # updates between two looks at whether the drone has crashed
+_DENSE, _EVERY = 50, 10  # updates whose intervals are stored: the first 50, then every tenth
+_CRASH_CHECK_PERIOD = 25  # updates between two checks for a crash
 CONVERGENCE_BANDS = {
     "mass_5": (0, 0.05),
     "mass_1": (0, 0.01),
@@ -41,7 +41,7 @@ class Task:
     Attributes:
         experiment: table1, offline or online.
         sensor: A, B or C.
-        method: published, crazyem, bound (offline: what can be known from the flight) or filter (table1).
+        method: published, crazyem, bound (offline: Cramer-Rao bound of the flight) or filter (table1).
         seed: of all noise.
     """
 
@@ -52,15 +52,15 @@ class Task:
 
     @property
     def name(self) -> str:
-        """Of its file, and in messages."""
+        """Name of the task, for its file and in messages."""
         return f"{self.experiment}-{self.sensor}-{self.method}-{self.seed:04d}"
 
 
 def plan(experiments: Iterable[str], sensors: Iterable[str], methods: Iterable[str], seeds: int) -> list[Task]:
-    """Every task that was asked for, in an order that suits processes which begin together on a fresh machine.
+    """All requested tasks, in an order that suits parallel processes without compiled kernels.
 
-    The first of each kind compiles its kernels; while one process compiles the estimator's, the others have tasks that
-    need none of them. At the end there are enough short ones for no process to be left with a long one alone.
+    The first task of each kind compiles its kernels. While one process compiles the estimator, the others get tasks
+    without the estimator. Short tasks come last, so that all processes finish at about the same time.
     """
     experiments, sensors, methods = tuple(experiments), tuple(sensors), tuple(methods)
 
@@ -78,12 +78,12 @@ def plan(experiments: Iterable[str], sensors: Iterable[str], methods: Iterable[s
 
 
 def run_task(task: Task, settings: Settings) -> dict[str, Any]:
-    """The record of a task: its name's parts, the results, and `timing`."""
+    """Run a task; the record holds the parts of its name, the results, and `timing`."""
     run: Callable[[Task, Settings], dict[str, Any]] = {
         ("table1", "filter"): _table1,
         ("offline", "published"): _offline_published,
         ("offline", "crazyem"): _offline_crazyem,
-        # of the whole flight; the methods' flights are the same, so it stands once for both
+        # bound of the whole flight; offline both methods have the same flight, so one bound serves both
         ("offline", "bound"): lambda task, of: _bounds(fly(of, task.seed), task.sensor, 0, of.steps + 1),
         ("online", "published"): _online_published,
         ("online", "crazyem"): _online_crazyem,
@@ -92,7 +92,7 @@ def run_task(task: Task, settings: Settings) -> dict[str, Any]:
     results = run(task, settings)
     timing = {
         "seconds": round(time.perf_counter() - begin, 4),
-        "cpu_seconds": round(time.process_time() - cpu, 4),  # what it takes where nothing else runs
+        "cpu_seconds": round(time.process_time() - cpu, 4),  # hardly depends on other processes
         **results.pop("timing", {}),
     }
     return {
@@ -158,23 +158,23 @@ def _bounds(flight: Flight, sensor: str, first: int, last: int) -> dict[str, Any
 
 
 def window_ends(settings: Settings) -> list[int]:
-    """Rows behind the last of disjoint windows, counted from the end, that begin after 8 s; at least the last one."""
+    """End rows (exclusive) of disjoint windows, placed from the end, that begin after 8 s; at least the last window."""
     ends = list(range(settings.steps + 1, settings.window, -settings.window))
     late = [end for end in ends if (end - settings.window) * settings.dt >= SETTLED_SECONDS]
     return (late or ends[:1])[::-1]
 
 
 def thin(count: int) -> list[int]:
-    """Which updates keep their intervals: all at first, then every tenth, and the last."""
+    """Indices of the updates whose intervals are stored: the first 50, then every tenth, and the last."""
     return sorted({*range(min(count, _DENSE)), *range(0, count, _EVERY), *([count - 1] if count else [])})
 
 
 def _fly_online(
     flight: Flight, update: Callable[[Flight], tuple[float, Any]], after: Callable[[], None] | None = None
 ) -> tuple[NDArray, list[float]]:
-    """A flight from m0 and I0: 4 steps, an update, its result to the controller, and so on to the end or the crash.
+    """Fly from m0 and I0: repeat 4 steps, an update, its result to the controller, until the end or a crash.
 
-    Returns: (updates, 4) mass kg, Ixx, Iyy, Izz kg m^2; s each update took.
+    Returns: (updates, 4) mass kg, Ixx, Iyy, Izz kg m^2; duration of each update [s].
     """
     s = flight.settings
     mass, inertia = s.mass_start, np.array(s.inertia_start)
@@ -193,7 +193,7 @@ def _fly_online(
 
 
 def _online_published(task: Task, settings: Settings) -> dict[str, Any]:
-    """As printed; if that ends in a crash, once more with estimates kept positive, and the record says so."""
+    """The published method as printed; after a crash a second flight with `clamp`, which the record notes."""
     flight = Flight(settings, task.seed)
     theta, seconds = _fly_online(flight, PublishedOnline(settings, task.sensor).update)
     crashed_after = short((flight.size - 1) * settings.dt) if flight.crashed else None
@@ -222,7 +222,7 @@ def _online_crazyem(task: Task, settings: Settings) -> dict[str, Any]:
         ci95 = intervals[window["update"]]
         window["ci95"] = None if ci95 is None else short(ci95)
     own = list(product.update_seconds)
-    if own:  # what the estimator itself took, without handing over samples
+    if own:  # time of the estimator alone, without handing over samples
         record["timing"] |= {f"estimator_{k}": v for k, v in _quantiles(own).items()}
     return record
 
@@ -252,7 +252,7 @@ def _online_record(task: Task, flight: Flight, theta: NDArray, seconds: list[flo
 
 
 def _tracking(flight: Flight) -> float | None:
-    """m, rms distance from the reference after one window (the first leg is spent finding the parameters)."""
+    """Rms distance from the reference [m] after one window (during the first window the parameters converge)."""
     first = min(flight.settings.window, flight.size // 2)
     error = flight.truth[first : flight.size, :3] - flight.reference[first : flight.size, :3]
     result: float | None = short(np.sqrt(np.mean(np.sum(error**2, axis=1))))
@@ -260,7 +260,7 @@ def _tracking(flight: Flight) -> float | None:
 
 
 def _times(theta: NDArray, settings: Settings) -> dict[str, Any]:
-    """s from the start: the first update within so much of the truth, and the one after which all are."""
+    """Times [s] from the start: first update inside each convergence band, and update after which all are inside."""
     truth = np.array([settings.mass, *settings.inertia])
     times = np.minimum(settings.every * (np.arange(len(theta)) + 1), settings.steps) * settings.dt
     found: dict[str, Any] = {}

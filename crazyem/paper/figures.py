@@ -1,4 +1,4 @@
-"""Figures 3-5 and 8-37 of the paper, drawn from the records of this run: its method dashed, crazyem beside it."""
+"""Figures 3-5 and 8-37 of the paper, drawn from the records of this run: paper's method dashed, crazyem beside it."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from crazyem.paper.published_values import FIGURES, PARAMETERS, PUBLISHED_RANGES
 from crazyem.paper.settings import Settings
 
 Record = Mapping[str, Any]
-DENSE_UPDATES, UPDATE_STRIDE = 100, 5  # of online curves: all updates at first, then every fifth; more does not show
+DENSE_UPDATES, UPDATE_STRIDE = 100, 5  # of online curves: the first 100 updates, then every fifth; more is not visible
 STATE_EVERY = 5  # rows of the state plots
 _DPI = 100
 _STYLE: Any = {
@@ -34,7 +34,7 @@ def draw_all(records: Sequence[Record], settings: Settings, folder: Path) -> lis
         settings: of the run; the flights of Fig. 3-5 and of the offline paths are flown again.
         folder: where to; must exist.
 
-    Returns: number, file (without suffix), caption, note (what differs from the paper's) of each, in order.
+    Returns: number, file (without suffix), caption, note (differences from the paper's figure) of each, in order.
 
     Raises: UsageError: a file cannot be written. MissingExtraError: no matplotlib.
     """
@@ -160,7 +160,7 @@ def _enlarge(axis: Any, settled: Sequence[float], shown: tuple[float, float], tr
 
 
 def _lines(axis: Any, x: NDArray, curves: Sequence[NDArray], style: Mapping[str, Any], label: str) -> None:
-    """All curves as one line with gaps: drawn several times faster than one by one."""
+    """Draw all curves as one line with gaps: several times faster than separate lines."""
     if curves:
         gap = [np.nan]
         ys = np.concatenate([part for curve in curves for part in (curve, gap)])
@@ -220,7 +220,7 @@ def _online(figure: Any, wanted: PaperFigure, settings: Settings, runs: Mapping[
 
 
 def _band(record: Record, column: int, scale: float) -> tuple[NDArray, NDArray]:
-    """(n,) updates and (n, 2) limits of the intervals that are known."""
+    """(n,) updates and (n, 2) limits of the stored intervals."""
     rows, limits = [], []
     for row, interval in zip(record["interval_rows"], record["intervals"]):
         if interval is not None and None not in interval[column]:

@@ -1,8 +1,8 @@
 """A simulated flight of the paper: plant, sensors A, B, C, filter and controller in closed loop, advanced in pieces.
 
-Row k of every array belongs to t = k dt. What the sensors say of the step from k - 1 to k (acceleration) stands in row
-k; the wrench in row k is held from k to k + 1. All random numbers are drawn beforehand from the seed, so a flight does
-not depend on the size of the pieces, and the sensors of one seed see the same noise.
+Row k of every array belongs to t = k dt. The acceleration reading in row k belongs to the step from k - 1 to k; the
+wrench in row k is held from k to k + 1. All random numbers are drawn in advance from the seed, so a flight does not
+depend on the size of the pieces, and all sensors of one seed have the same noise.
 """
 
 from collections.abc import Iterator
@@ -19,9 +19,9 @@ from crazyem.paper.settings import Settings
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import GRAVITY
 
-LIFTED_HEIGHT = 0.1  # m measured above the floor: the reference starts (7 standard deviations of the position sensor)
-THRUST_RAMP = 2.0  # N/s of thrust until then, where there is a floor
-# s in which the drone, which rises by then, is led onto the reference, which begins at rest on the floor
+LIFTED_HEIGHT = 0.1  # m, measured height at which the reference starts (7 standard deviations of the position sensor)
+THRUST_RAMP = 2.0  # N/s, increase of thrust before lift-off from a floor
+# s, time constant of the transition from the rising drone to the reference, which begins at rest on the floor
 MERGE_SECONDS = 0.5
 
 
@@ -30,12 +30,12 @@ def _advance(
     first, last, dt, truth_mass, truth_inertia, mass, inertia, gains, limit, reference, ground, lift_off, handover,
     substeps, noise, sensor_noise, sensor_sd, q, r, truth, estimate, covariance, wrench, readings, contact,
 ):  # fmt: skip
-    """Fly steps first..last-1; returns the row of lift-off, -1 while the drone waits for it."""
+    """Fly steps first..last-1; returns the row of lift-off, -1 before lift-off."""
     scratch = np.empty(12)
     axis = np.empty(3)
     mean = np.empty(3)
     goal = np.empty(9)
-    up = np.zeros(9)  # wanted before lift-off: to stay above the start; height is the ramp's
+    up = np.zeros(9)  # goal before lift-off: stay above the start; the thrust ramp determines the height
     up[:2] = truth[0, :2]
     h = dt / substeps
     for k in range(first, last):
@@ -77,7 +77,7 @@ def _advance(
 
 @compiled
 def _lead(handover, t, goal):
-    """Add to goal (9,) the distance (3,) and velocity (3,) at take-off, critically damped, t s later."""
+    """Add the offset and velocity at take-off to goal (9,), decayed (critically damped) over t s since take-off."""
     for i in range(3):
         d = handover[0, i]
         b = handover[1, i] + d / MERGE_SECONDS
@@ -90,7 +90,7 @@ def _lead(handover, t, goal):
 
 @compiled
 def _specific_force(x, reading, axis):
-    """What an accelerometer fixed to the body reads: acceleration minus gravity in body axes, noise included."""
+    """Reading of a body-fixed accelerometer: acceleration minus gravity in body axes, noise included."""
     total = np.empty(3)
     for i in range(3):
         total[i] = reading[12 + i]
@@ -110,18 +110,18 @@ class Flight:
     Args:
         settings: of the simulation.
         seed: of all noise.
-        ground: whether z = 0 is a floor. The drone then starts on it. Thrust ramps up until the drone is seen to have
-            lifted, while the controller keeps it upright and above the start. There thrust stays while no mass is
-            known; when one is, the reference begins, and where the drone is and how it rises is led onto it.
+        ground: whether z = 0 is a floor. The drone then starts on the floor. Thrust ramps up until the measured height
+            shows lift-off; the controller keeps the drone upright above the start. Thrust then stays constant until a
+            mass estimate exists. Then the reference begins, with a smooth transition from the drone's motion.
 
     Attributes:
-        size: rows known so far (the last step flown ends at size - 1).
+        size: rows flown so far (the last step ends at row size - 1).
         truth: (n + 1, 12) position m, velocity m/s, roll pitch yaw rad, body rate rad/s.
-        estimate: (n + 1, 12) the same from the filter the controller uses (sensor A).
+        estimate: (n + 1, 12) the same, estimated by the controller's filter (sensor A).
         wrench: (n + 1, 4) thrust N, torque N m commanded from each row on.
         readings: (n + 1, 18) position, velocity, angles, rate, acceleration (world), specific force (body), with noise.
-        reference: (n + 1, 9) position, velocity, acceleration wanted.
-        contact: (n + 1,) whether the step that ended stood on the floor.
+        reference: (n + 1, 9) desired position, velocity, acceleration.
+        contact: (n + 1,) whether the drone stood on the floor in the previous step.
         lift_off: row where the reference began, -1 before.
     """
 
@@ -163,7 +163,7 @@ class Flight:
 
     @property
     def crashed(self) -> bool:
-        """Whether the drone lies upside down, fell far below the start, or its state is no number any more."""
+        """Whether the drone is upside down, fell far below the start, or has a state that is not finite."""
         x = self.truth[: self.size]
         return bool(
             not np.all(np.isfinite(x))
@@ -172,9 +172,9 @@ class Flight:
         )
 
     def advance(self, steps: int, *, mass: float | None, inertia: tuple[float, float, float] | NDArray) -> None:
-        """Fly so many steps (fewer at the end); mass kg and inertia (3,) kg m^2 are what the controller believes.
+        """Fly `steps` steps (fewer at the end); the controller uses mass kg and inertia (3,) kg m^2.
 
-        A mass of None says that none is known yet, which a take-off from the floor can wait for.
+        A mass of None means unknown; this is possible only before lift-off from a floor.
 
         Raises: UsageError: no mass is known and there is no floor, or the reference has begun.
         """
@@ -192,7 +192,7 @@ class Flight:
         self.size = last + 1
 
     def samples(self, sensor: str, first: int = 0, last: int | None = None) -> Iterator[Sample]:
-        """What a sensor says of rows first..last-1, as samples for the estimator; inputs follow the measurements.
+        """Readings of a sensor in rows first..last-1 as samples for the estimator; inputs follow the measurements.
 
         Args:
             sensor: A (position, specific force, body rate), B (full state) or C (position, velocity, body rate).
@@ -210,7 +210,7 @@ class Flight:
             yield Sample("body_rate", t, tuple(row[9:12]))
             if sensor == "A" and k:
                 yield Sample("specific_force", t, tuple(row[15:18]))
-            if k + 1 < self.size:  # the wrench of the newest row is not decided yet
+            if k + 1 < self.size:  # the wrench of the newest row is not known yet
                 yield Sample("wrench_command", t, tuple(self.wrench[k].tolist()))
 
 
@@ -226,7 +226,7 @@ def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, fl
 
 
 def reference(settings: Settings) -> NDArray:
-    """(n + 1, 9) position m, velocity m/s, acceleration m/s^2 wanted: waypoints at equal times, steps or smoothed."""
+    """(n + 1, 9) desired position m, velocity m/s, acceleration m/s^2: waypoints at equal times, steps or smoothed."""
     n = settings.steps
     out = np.zeros((n + 1, 9))
     points = np.array([settings.start, *settings.waypoints])

@@ -1,4 +1,4 @@
-"""tables.md and index.html: what a run gave, beside what the paper prints; plain files, complete in themselves."""
+"""tables.md and index.html: results of a run beside the paper's values; self-contained files."""
 
 import html
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,7 +19,7 @@ figcaption { font-size: 13px; }"""
 
 
 def corrections_grid() -> Grid:
-    """What had to be changed before the paper's algorithm ran."""
+    """Corrections without which the paper's algorithm does not run."""
     rows = tuple((c.equation, c.printed, c.used, c.why) for c in CORRECTIONS)
     note = "Everything else of the published method is as printed, wrong or not (docs/explanation/errata.md)."
     return Grid("Corrections to the published method", ("equation", "printed", "used", "why"), rows, note)

@@ -1,10 +1,10 @@
-"""The quadcopter of the paper as a stochastic differential equation, and the filter that it flies with (VII).
+"""The quadcopter of the paper as a stochastic differential equation, and the filter of its controller (VII).
 
-State (12,): position m, velocity m/s (world), roll pitch yaw rad, body rate rad/s, stepped as eq. 56 says
-(Euler-Maruyama). Written down from eq. 47, 54 and 55 (with the errata of 46 and 48) and shared with no estimator, so
-that none can inherit its mistakes. In the extended Kalman filter position and body rate correct, acceleration is an
-input. Its attitude is dead reckoning from a known start, since eq. 59 has no derivative of velocity by attitude; that
-is kept, Table I shows it.
+State (12,): position m, velocity m/s (world), roll pitch yaw rad, body rate rad/s, integrated by eq. 56
+(Euler-Maruyama). The equations are 47, 54 and 55 (with the errata of 46 and 48). No estimator uses this code, so an
+error here cannot be in both. In the extended Kalman filter, position and body rate are measurements and acceleration
+is an input. The filter's attitude is dead reckoning from a known start, because eq. 59 has no derivative of velocity
+with respect to attitude; this is kept as printed, Table I shows the effect.
 """
 
 import numpy as np
@@ -59,13 +59,13 @@ def step(x, wrench, noise, dt, mass, inertia, ground, scratch):
         wrench: (4,) thrust N, torque N m.
         noise: (4,) noise of thrust and torque, same units, held over the step.
         mass, inertia: kg, (3,) kg m^2.
-        ground: whether z = 0 is a floor that the drone cannot fall through; it stands there level and does not slip.
+        ground: whether z = 0 is a floor; a drone on the floor stands level and does not slip.
         scratch: (12,) receives the derivative; [3:6] is the acceleration of the step.
     """
     torque = wrench[1:] + noise[1:]
     derivative(x, wrench[0] + noise[0], torque, mass, inertia, scratch)
     if ground and x[2] <= 0.0 and x[5] + dt * scratch[5] <= 0.0:
-        x[2:9] = 0.0  # the heading is lost, too: it is zero throughout
+        x[2:9] = 0.0  # also the heading: it is zero in all flights
         x[9:12] = 0.0
         scratch[:] = 0.0
         return True
@@ -123,7 +123,7 @@ def filter_step(x, p, acceleration, position, rate, dt, q, r):
     p[:, :] = phi @ p @ phi.T
     for i in range(12):
         p[i, i] += q
-    # six scalars one after the other: the same as eq. 73-76 with a diagonal R
+    # six scalar updates: same result as eq. 73-76 with a diagonal R
     for c in range(6):
         i = c if c < 3 else c + 6
         y = position[c] if c < 3 else rate[c - 3]

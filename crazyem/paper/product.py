@@ -1,8 +1,9 @@
-"""The product's own estimator on the paper's flights: the very `OnlineEstimator` that flies, fed with samples.
+"""The product's estimator on the paper's flights: the same `OnlineEstimator` as in flight, fed with samples.
 
-It is told what a user could tell it: that thrust and torque are its inputs, how the simulator steps (explicitly by eq.
-56, unless it takes smaller steps than it samples) and whether there is an accelerometer. It is told neither parameters
-nor noise: the paper's cold start (eq. 116, 117) stands where the vehicle file's constants would, with its wide prior.
+The estimator gets only information that a user has: thrust and torque are the inputs, the way the simulator steps
+(explicitly by eq. 56, unless it takes smaller steps than it samples), and whether there is an accelerometer. Parameters
+and noise stay unknown: the paper's cold start (eq. 116, 117) replaces the constants of the vehicle file, with a wide
+prior.
 """
 
 import time
@@ -26,15 +27,15 @@ NO_UPDATE = 10**9  # samples between updates when only the last one is wanted
 
 @dataclass(frozen=True)
 class Fit:
-    """What the estimator says of one stretch of flight.
+    """The estimate from one part of a flight.
 
     Attributes:
         value: (4,) mass kg, Ixx, Iyy, Izz kg m^2.
         sd: (4,) standard deviations, same units.
         ci95: (4, 2) 95 % intervals.
         converged: whether the score test was passed.
-        passes: full passes that it took; 0 where the estimator does not say.
-        history: (passes + 1, 4) value before each pass and at the end; empty where the estimator does not say.
+        passes: number of full passes; 0 if the estimator does not store them.
+        history: (passes + 1, 4) value before each pass and at the end; empty if the estimator does not store it.
         noise: scales by name, as `Estimate.noise`.
         seconds: wall-clock time without handing over the samples.
     """
@@ -50,7 +51,7 @@ class Fit:
 
 
 def known_noise(settings: Settings) -> KnownNoise:
-    """The intensities of the simulation's process noise, for an estimator that is told h (all else stays unknown)."""
+    """The intensities of the simulation's process noise, for an estimator that knows h (all else stays unknown)."""
     return KnownNoise(force=settings.force_noise, torque=settings.torque_noise, lateral_force=0.0)
 
 
@@ -68,20 +69,20 @@ def estimator_for(
     """A new estimator for flights with these settings.
 
     Args:
-        settings: window, update interval, start values and the way of stepping are taken from it, nothing else.
+        settings: only window, update interval, start values and the way of stepping are used.
         sensor: A, B or C; A has an accelerometer.
         window, every: samples, where they differ from the settings.
         mass, inertia: kg, (3,) kg m^2 to start from, where they differ from the settings.
-        known: noise it is told.
-        accelerometer: whether A's is used.
+        known: noise that the estimator knows.
+        accelerometer: whether to use the accelerometer of sensor A.
 
-    Raises: UsageError: there is no such sensor, or a value the estimator refuses.
+    Raises: UsageError: no such sensor, or a value that the estimator refuses.
     """
     if sensor not in {"A", "B", "C"}:
         raise UsageError(f"unknown sensor '{sensor}' (known: A, B, C)")
     mass = settings.mass_start if mass is None else mass
     inertia = settings.inertia_start if inertia is None else inertia
-    vehicle = replace(load_vehicle("zhao"), mass=mass, inertia=inertia)  # the preset holds the truth
+    vehicle = replace(load_vehicle("zhao"), mass=mass, inertia=inertia)  # replaces the true values of the preset
     return OnlineEstimator(
         vehicle,
         window=settings.window if window is None else window,
@@ -106,12 +107,12 @@ def product_offline(
     known: KnownNoise | None = None,
     accelerometer: bool = True,
 ) -> Fit:
-    """One estimate from rows first..last-1 as a single window, converged.
+    """One converged estimate from rows first..last-1 as a single window.
 
     Args:
-        flight: its samples are read, nothing else.
+        flight: only its samples and settings are used.
         sensor, mass, inertia, known, accelerometer: as for `estimator_for`.
-        first, last: rows; last defaults to all that is known.
+        first, last: rows; last defaults to all rows flown.
 
     Raises: UsageError: no such sensor, or too few rows.
     """
@@ -127,7 +128,7 @@ def product_offline(
     begin = time.perf_counter()
     estimate = estimator.finish()
     seconds = time.perf_counter() - begin
-    # parameters before each full pass of the last convergence, and at its end, where the estimator keeps them
+    # parameters before each full pass of the last convergence, and at its end, if the estimator stores them
     trace = np.array([theta[:4] for theta in getattr(estimator, "trace", ())]).reshape(-1, 4)
     said = [estimate[name] for name in PARAMETERS]
     return Fit(
@@ -143,14 +144,14 @@ def product_offline(
 
 
 class ProductOnline:
-    """The estimator in the loop: after every piece of flight it gets the new rows and says mass and inertia.
+    """The estimator in the loop: it gets the new rows after every piece of flight and returns mass and inertia.
 
-    It uses a row once the next one is there, with its wrench: of a flight of n rows, the first n - 2. Pieces of 4 rows
-    after a first one of 5 therefore end with an update each.
+    The estimator uses a row when the next row and its wrench are known: of a flight of n rows, the first n - 2. After a
+    first piece of 5 rows, every piece of 4 rows therefore ends with an update.
 
     Attributes:
         estimate: the latest, None before the first.
-        estimator: the product's own.
+        estimator: the product's estimator.
     """
 
     def __init__(self, settings: Settings, sensor: str, *, accelerometer: bool = True) -> None:
@@ -164,15 +165,15 @@ class ProductOnline:
 
     @property
     def update_seconds(self) -> list[float]:
-        """Wall-clock cost of each of the estimator's updates [s]."""
+        """Wall-clock time of each update of the estimator [s]."""
         return self.estimator.update_seconds
 
     def update(self, flight: Flight) -> tuple[float, NDArray]:
         """Hand over the rows since the last call; returns mass [kg] and inertia (3,) [kg m^2] for the controller.
 
-        They are the start values until the estimator has said something.
+        Before the first estimate these are the start values.
         """
-        if 0 < self._rows < flight.size:  # the wrench of what was then the newest row is known now
+        if 0 < self._rows < flight.size:  # the wrench of the newest row of the last call is known now
             k = self._rows - 1
             self._feed(Sample("wrench_command", k * flight.settings.dt, tuple(flight.wrench[k].tolist())))
         for sample in flight.samples(self._sensor, self._rows, flight.size):

@@ -1,12 +1,12 @@
-"""The paper's own algorithm as printed (section X), with only those corrections without which it does not run.
+"""The paper's algorithm as printed (section X), with only the corrections without which it does not run.
 
-It is here to be compared with, not to be used: the product's estimator is crazyem.estimation. What was corrected stands
-in published_values.CORRECTIONS, with the reasons; everything else is kept, the isotropic Q0 and R0, the Jacobian
-without the tilt (eq. 59) and the smoother that ignores it (eq. 95) included.
+It serves for comparison only; the product's estimator is crazyem.estimation. published_values.CORRECTIONS lists the
+corrections with reasons. Everything else is as printed, including the isotropic Q0 and R0, the Jacobian without the
+tilt (eq. 59) and the smoother that ignores this Jacobian (eq. 95).
 
 Kernels: filter (eq. 88-93), smoother (94-98), mass (107), inertia (appendix). With isotropic P0, Q0, R0 and the
-Jacobian of eq. 59 the covariance never couples position and velocity with angles and rates, nor one axis of position
-with another, and is the same for the three: three numbers and a 6 by 6 block hold it.
+Jacobian of eq. 59, the covariance couples neither position and velocity with angles and rates nor the axes of position,
+and is equal for these axes. Three numbers and a 6 by 6 block therefore represent it.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ from crazyem.vehicle import GRAVITY
 def _predict_angular(p, a, b, q, half):
     """Eq. 89 for angles and rates: p (6, 6) in place, both triangles; half (3, 6) is scratch.
 
-    a (3, 3) by angles, b (3, 3) by rates: rows of the angles in eq. 59.
+    a (3, 3), b (3, 3): derivatives of the angles' rows in eq. 59 with respect to angles and rates.
     """
     for i in range(3):
         for j in range(6):
@@ -122,8 +122,8 @@ def expectation(
     """E-step: extended Kalman filter forwards, Rauch-Tung-Striebel backwards, as printed.
 
     Args:
-        observed: (n, 12) observations, world and body SI units as the state; the angles are not read unless
-            `sees_angles`. H is the identity otherwise.
+        observed: (n, 12) observations, in frames and SI units of the state. H is the identity, without the rows of the
+            angles unless `sees_angles`.
         wrench: (n, 4) thrust N and torque N m held from each row to the next; the last row is not used.
         first: (12,) mean of the state at the first row before its observation.
         theta: (4,) mass kg, inertia kg m^2.
@@ -132,7 +132,7 @@ def expectation(
         predicted, filtered, smoothed: (>= n, 12) are filled; linear (>= n, 3) and angular (>= n, 6, 6) with the
             covariance after each row (position-velocity per axis; angles and rates).
 
-    The smoothed covariance (eq. 98) is left out: neither eq. 107 nor the appendix reads it.
+    The smoothed covariance (eq. 98) is left out, because neither eq. 107 nor the appendix uses it.
     """
     n = observed.shape[0]
     phi = np.empty((12, 12))
@@ -206,9 +206,9 @@ def maximisation(x, wrench, theta, dt, clamp, lowest, highest, new):
 
     Args:
         x: (n, 12) smoothed states. wrench: (n, 4) thrust N, torque N m held from each row to the next.
-        theta: (4,) the last parameters; the formula of each axis takes the others' inertia from here.
+        theta: (4,) the last parameters; the formula of each axis uses the inertia of the other axes from here.
         dt: s.
-        clamp: keep the last value where the new one is no number between lowest and highest, (4,) each.
+        clamp: keep the last value if the new one is not between lowest and highest, (4,) each.
         new: (4,) is filled: mass kg, inertia kg m^2.
     """
     top = np.zeros(4)
@@ -232,7 +232,7 @@ def maximisation(x, wrench, theta, dt, clamp, lowest, highest, new):
 
 __all__ = ["CORRECTIONS", "Correction", "PublishedFit", "PublishedOnline", "published_offline"]
 
-# `clamp` refuses an inertia further than this from I0: ten times too stiff a rate loop still is stable
+# `clamp` refuses an inertia that differs from I0 by a larger factor: with a factor of ten the rate loop is still stable
 LARGEST_INERTIA_RATIO = 10.0
 
 Angles = Literal["zero", "dead-reckoned"]
@@ -240,7 +240,7 @@ Angles = Literal["zero", "dead-reckoned"]
 
 @dataclass(frozen=True)
 class PublishedFit:
-    """What the EM iterations of one flight gave.
+    """The result of the EM iterations on one flight.
 
     Attributes:
         theta: (n_iterations + 1, 4) mass kg, Ixx, Iyy, Izz kg m^2 after each EM iteration, the start first.
@@ -278,7 +278,7 @@ class _Workspace:
 
 
 def _observed(flight: Flight, sensor: str, first: int) -> NDArray:
-    """(n, 12) what the paper gives to the E-step from row `first` on: sensor A's filter, or readings."""
+    """(n, 12) observations for the E-step from row `first` on: for sensor A its filter's states, else readings."""
     if sensor == "A":
         return flight.estimate[first : flight.size]
     rows = flight.readings[first : flight.size, :12]
@@ -299,13 +299,13 @@ def published_offline(flight: Flight, sensor: str, *, angles: Angles = "zero", i
     """EM over all rows of a flight, from m0 and I0 (eq. 116, 117).
 
     Args:
-        flight: flown, two rows at least.
+        flight: at least two rows.
         sensor: A (the states of the state filter are the observations), B (full state) or C (no angles).
-        angles: how C's missing angles are taken: read as "zero", as the printed bias implies, or "dead-reckoned" from
-            the start (their rows dropped from H).
-        iterations: of EM.
+        angles: treatment of C's missing angles: observed as "zero", as the printed bias implies, or "dead-reckoned"
+            from the start (their rows dropped from H).
+        iterations: number of EM iterations.
 
-    Raises: UsageError: no such sensor or way to take the angles; fewer than two rows.
+    Raises: UsageError: no such sensor or treatment of the angles; fewer than two rows.
     """
     _check(sensor, angles)
     if flight.size < 2:
@@ -329,15 +329,15 @@ def published_offline(flight: Flight, sensor: str, *, angles: Angles = "zero", i
 class PublishedOnline:
     """One EM iteration over the newest rows of a flight (800, XI-A2) at each call, parameters carried over.
 
-    The paper does not say how many iterations an update takes. "200 iterations" until convergence (XI-C) are 800
-    samples at 4 a time: one each.
+    The paper does not give the number of iterations per update. "200 iterations" until convergence (XI-C) for 800
+    samples at 4 samples per update mean one iteration each.
 
     Args:
         settings: of the flight.
-        sensor, angles: as in `published_offline`. Dead-reckoned angles go on from where the last window's filter saw
-            the row that is now the first (its smoother, which ignores Phi, would carry them away).
-        clamp: whether a mass that is not positive, or an inertia off I0 by a factor over `LARGEST_INERTIA_RATIO`,
-            is refused and the last one kept. As printed it is not (False); some flights from m0 = 1 g then crash.
+        sensor, angles: as in `published_offline`. Dead-reckoned angles start from the last window's filtered angles at
+            the row that is now the first (smoothed angles would drift, because the smoother ignores Phi).
+        clamp: whether to refuse a mass that is not positive, or an inertia that differs from I0 by a factor over
+            `LARGEST_INERTIA_RATIO`, and keep the last one. As printed: False; some flights from m0 = 1 g then crash.
 
     Attributes:
         theta: (4,) mass kg, Ixx, Iyy, Izz kg m^2, newest.

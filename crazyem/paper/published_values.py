@@ -1,7 +1,7 @@
-"""What the paper prints: its tables, the ranges in its text, the captions of its figures; and what had to be corrected.
+"""Values printed in the paper (tables, ranges in the text, captions of figures), and the necessary corrections.
 
 Source: Zhao, "Online parameter estimation for the Crazyflie quadcopter through an EM algorithm". SI units throughout.
-All that is not among the corrections was kept, wrong or not.
+Everything without a correction is as printed, even where it is wrong.
 """
 
 import tomllib
@@ -40,7 +40,7 @@ PUBLISHED_RANGES: dict[tuple[str, str], dict[str, tuple[float, float]]] = {
     },
 }  # fmt: skip
 
-# The paper says when a curve has settled in iterations; online one iteration is one update of 4 steps.
+# Settling times in the paper are in iterations; online one iteration is one update of 4 steps.
 CONVERGENCE = {
     ("offline", "mass"): "around the 4th iteration (text to Fig. 14)",
     ("online", "all"): "around the 200th iteration (text to Fig. 26, 29, 31, 37)",
@@ -65,7 +65,7 @@ class PaperFigure:
         experiment: "table1" (Fig. 3-5), "offline" or "online".
         sensor: A, B or C.
         parameter: of a convergence plot, else "".
-        caption: what it shows, in the paper's words.
+        caption: description in the paper's words.
     """
 
     number: int
@@ -107,12 +107,12 @@ NOT_RESULTS = {
 
 @dataclass(frozen=True)
 class Correction:
-    """One place of the paper.
+    """One correction of the paper.
 
     Attributes:
         equation: number or section.
-        printed, used: the two forms.
-        why: why it does not run as printed, or what had to be decided.
+        printed, used: the form in the paper, and the form in this program.
+        why: reason why the printed form does not run, or the choice that was necessary.
     """
 
     equation: str

@@ -1,4 +1,4 @@
-"""Finished tasks on disk, so that a run that was stopped goes on where it was; and results.json made of them."""
+"""Records of finished tasks on disk, so that a stopped run can continue, and results.json from these records."""
 
 import ast
 import hashlib
@@ -17,10 +17,10 @@ from crazyem.paper.experiments import Task, run_task
 from crazyem.paper.settings import Settings, described
 
 SCHEMA = "crazyem paper 1"
-LARGEST_TASK_FILE = 20_000_000  # bytes of a task file that is ours; a whole flight of updates takes 0.1 MB
+LARGEST_TASK_FILE = 20_000_000  # bytes; larger task files count as damaged. The updates of a whole flight take 0.1 MB
 
 _PACKAGE = Path(__file__).resolve().parents[1]
-# What the numbers of a task come from. Tables and figures are made anew each time.
+# Files on which the numbers of a task depend. Tables and figures are made anew in each run.
 _CODE = ("physics/**/*.py", "signals/**/*.py", "control/**/*.py", "estimation/**/*.py", "presets/zhao.toml",
          "vehicle.py", "compiled.py", "paper/*.py")  # fmt: skip
 _TEXT_MODULES = "runner tables table_text figures pages published_values"
@@ -29,7 +29,7 @@ _VERSIONED_PACKAGES = ("numpy", "scipy", "numba")
 
 
 def code_hash(method: str = "crazyem") -> str:
-    """Of all files that the numbers of a method come from; only crazyem's come from the estimator."""
+    """Hash of all files on which the numbers of a method depend; only crazyem's numbers depend on the estimator."""
     return _hash(method == "crazyem")
 
 
@@ -46,13 +46,13 @@ def _hash(with_estimator: bool) -> str:
 
 @cache
 def _meaning(path: Path) -> str:
-    """What a file does: without comments and layout, which change nothing."""
+    """The content of a file without comments and layout, which do not affect results."""
     text = path.read_text(encoding="utf-8")
     return ast.dump(ast.parse(text)) if path.suffix == ".py" else text
 
 
 def environment() -> dict[str, Any]:
-    """What the numbers depend on besides the settings."""
+    """Versions and machine on which the numbers depend besides the settings."""
     return {
         "crazyem": metadata.version("crazyem"),
         "code": code_hash(),
@@ -64,24 +64,24 @@ def environment() -> dict[str, Any]:
 
 
 def fingerprint(settings: Settings, method: str) -> str:
-    """Of everything that a record depends on besides its task."""
+    """Hash of everything on which a record depends besides its task."""
     text = json.dumps([SCHEMA, asdict(settings), {**environment(), "code": code_hash(method)}], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 def task_file(folder: Path, task: Task) -> Path:
-    """Where a task's record is kept in the output folder."""
+    """The file of a task's record in the output folder."""
     return folder / "tasks" / f"{task.name}.json"
 
 
 def run_and_store(task: Task, settings: Settings, folder: str, stamp: str) -> None:
-    """Run a task and write its record, whole or not at all. Raises UsageError: it cannot be written."""
+    """Run a task and write its record atomically. Raises UsageError: the record cannot be written."""
     record = run_task(task, settings)
     write_file(task_file(Path(folder), task), json.dumps({"fingerprint": stamp, "record": record}, allow_nan=False))
 
 
 def prepare(folder: Path) -> None:
-    """Make the output folder, without unfinished files of a stopped run. Raises UsageError: it cannot be made."""
+    """Make the output folder and delete incomplete files of a stopped run. Raises UsageError: it cannot be made."""
     try:
         (folder / "tasks").mkdir(parents=True, exist_ok=True)
         (folder / "figures").mkdir(exist_ok=True)
@@ -92,7 +92,7 @@ def prepare(folder: Path) -> None:
 
 
 def stored(folder: Path, task: Task, stamp: str) -> tuple[dict[str, Any] | None, str]:
-    """The record of a finished task, or None and why: "missing", "other" (settings or version) or "damaged"."""
+    """The record of a finished task; or None and the reason: "missing", "other" (settings or version) or "damaged"."""
     path = task_file(folder, task)
     try:
         if path.stat().st_size > LARGEST_TASK_FILE:
@@ -137,8 +137,8 @@ def assemble(
 
     Args:
         records: of all tasks, in any order.
-        derived: tables and the like made of them (see `tables.derive`).
-        timing: of the run; beside it stands what the tasks say of their own cost.
+        derived: tables and statistics of the records (see `tables.derive`).
+        timing: of the run; the cost of the tasks is added.
     """
     ordered = sorted(records, key=lambda r: (r["experiment"], r["sensor"], r["method"], r["seed"]))
     return {
@@ -152,7 +152,7 @@ def assemble(
 
 
 def cost_profile(records: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """What each kind of task costs: count, seconds, processor seconds; of updates the median over flights."""
+    """Cost of each kind of task: count, seconds, processor seconds; for updates the median over flights."""
     kinds: dict[str, list[Mapping[str, Any]]] = {}
     for record in records:
         kinds.setdefault(f"{record['experiment']} {record['method']}", []).append(record["timing"])

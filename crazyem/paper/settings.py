@@ -1,6 +1,6 @@
-"""What the paper leaves unsaid, and says: every setting of its simulation with the reason for its value.
+"""Settings of the paper's simulation, printed or not printed in the paper, each with the reason for its value.
 
-Settings change by NAME=VALUE, each checked for its type and a sane range.
+NAME=VALUE changes a setting; type and range of the value are checked.
 """
 
 import math
@@ -17,10 +17,10 @@ def _setting(default: Any, unit: str, reason: str) -> Any:
 
 @dataclass(frozen=True)
 class Settings:
-    """One way to read the paper (SI). `describe` lists every value with its reason.
+    """One interpretation ("reading") of the paper (SI). `describe` lists every value with its reason.
 
-    The defaults are the reading called p5: what an earlier study of the tables decoded (chosen with Tables II to V in
-    view: gains, torque noise, position weights). `LITERAL` is another, which takes what is printed as printed.
+    The defaults are the reading p5: gains, torque noise and position weights are chosen to reproduce Tables II to V.
+    The reading `LITERAL` takes printed values as printed.
     """
 
     mass: float = _setting(0.18, "kg", "printed (VI-B)")
@@ -75,10 +75,10 @@ class Settings:
 
 P5 = Settings()
 
-# What is printed taken literally, and what is not printed from Table I. Sd over mean of its errors is 0.755, that is
-# sqrt(pi/2 - 1), so they are of one axis each and Gaussian, 0.0128 m; the printed filter makes that of a sensor of
-# 0.0139 m, and of the same number in rad/s the printed angle error. Chosen by looking at Tables II to V are the rate
-# gain, the position weights and the acceleration limit (8 of 6 to 11).
+# Printed values as printed; missing values from Table I. Its errors have an sd over mean of 0.755 = sqrt(pi/2 - 1), so
+# they are absolute values of a Gaussian error of one axis, 0.0128 m. The printed filter has this error with a sensor of
+# 0.0139 m, and the printed angle error with the same number in rad/s. Rate gain, position weights and acceleration
+# limit (8, out of 6 to 11) are chosen by Tables II to V.
 LITERAL = Settings(
     torque_noise=0.005,  # n1:3 ~ N(0, h), the same h as thrust: 15 deg rms of tilt
     position_sd=0.0139, velocity_sd=0.0139, attitude_sd=0.0139, body_rate_sd=0.0139, acceleration_sd=0.0139,
@@ -91,7 +91,7 @@ LITERAL = Settings(
 READINGS = {"p5": P5, "literal": LITERAL}
 
 
-# Nothing that flies, and no simulation of it that ends, is outside of these. Names without an entry: any finite number.
+# Limits of drones that can fly and of simulations that end. Names without an entry: any finite number.
 _LIMITS: dict[str, tuple[float, float]] = {
     "mass": (1e-4, 100.0), "inertia": (1e-9, 10.0), "dt": (1e-4, 0.05), "duration": (0.1, 600.0),
     "start": (-1e3, 1e3), "waypoints": (-1e3, 1e3),
@@ -194,7 +194,7 @@ def _together(s: Settings) -> None:
 
 
 def described(settings: Settings) -> list[dict[str, Any]]:
-    """Name, value, unit and reason of every setting; the reason of a changed one is that of the value it had."""
+    """Name, value, unit and reason of every setting; for a changed setting the reason of its default."""
     usual = Settings()
     entries = settings.describe()
     for entry in entries:
@@ -215,7 +215,7 @@ def describe_text(settings: Settings) -> str:
 
 
 def _text(value: Any) -> str:
-    """As `--set` takes it."""
+    """A value as text in the format of `--set`."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, tuple):

@@ -20,20 +20,20 @@ class Grid:
     note: str = ""
 
     def markdown(self, *, heading: str = "##") -> str:
-        """With a heading, unless that is empty."""
+        """The table as Markdown, with a heading unless `heading` is empty."""
         lines = [f"{heading} {self.title}", ""] if heading else []
         lines += [_row(self.head), _row(["---"] * len(self.head)), *(_row(r) for r in self.rows)]
         return "\n".join([*lines, *(["", self.note] if self.note else [])])
 
     def text(self) -> str:
-        """For a terminal, columns aligned."""
+        """The table as text for a terminal, columns aligned."""
         rows = (self.head, *self.rows)
         widths = [max(len(row[i]) for row in rows) for i in range(len(self.head))]
         lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths)).rstrip() for row in rows]
         return "\n".join([self.title, *(f"  {line}" for line in lines)])
 
     def html(self) -> str:
-        """With a heading."""
+        """The table as HTML, with a heading."""
         head = "".join(f"<th>{html.escape(c)}</th>" for c in self.head)
         body = "\n".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in self.rows)
         note = f"<p>{html.escape(self.note)}</p>" if self.note else ""
@@ -57,12 +57,12 @@ def span(values: Sequence[float] | None, parameter: str) -> str:
 
 
 def percent(value: float | None, digits: int = 2, *, sign: bool = False) -> str:
-    """A share as %."""
+    """A fraction as %."""
     return "-" if value is None else f"{100 * value:{'+' if sign else ''}.{digits}f} %"
 
 
 def number(value: float | None, form: str = ".2f") -> str:
-    """A number, or - where there is none."""
+    """A number as text, or - for None."""
     return "-" if value is None else format(value, form)
 
 
@@ -114,7 +114,7 @@ _TABLE_TITLES = {
 
 
 def table_grid(cells: Iterable[Record], table: str) -> Grid | None:
-    """One of Tables II to V; None if nothing of it was run."""
+    """One of Tables II to V; None if no run belongs to it."""
     chosen = [c for c in cells if c["table"] == table]
     if not chosen:
         return None
@@ -142,7 +142,7 @@ def table_grid(cells: Iterable[Record], table: str) -> Grid | None:
 
 
 def _here(cell: Record, method: str) -> tuple[str, str, str]:
-    """Range, its width over the paper's, whether it overlaps the paper's."""
+    """The range of a method's values, its width over the paper's width, and whether it overlaps the paper's range."""
     if not cell[method]:
         return "-", "-", "-"
     found = cell[method]
@@ -179,7 +179,7 @@ def errors_grid(cells: Iterable[Record]) -> Grid:
 
 
 def convergence_grid(flights: Iterable[Record]) -> Grid:
-    """Times to come near the truth, online."""
+    """Online convergence times to the true values."""
     rows = []
     for f in flights:
         inertia = [f[f"{name}_25_first"] for name in PARAMETERS[1:]]

@@ -1,4 +1,4 @@
-"""Tables I to V: each cell as the paper prints it, as its method and ours give it here, and the bound."""
+"""Tables I to V: each cell with the paper's values, the results of its method and of crazyem, and the bound."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,7 +15,7 @@ Record = Mapping[str, Any]
 
 
 def expected_range(count: int) -> float:
-    """Mean of largest minus smallest of so many standard normal numbers (3.73 for 20)."""
+    """Expected range (largest minus smallest) of `count` standard normal numbers (3.73 for 20)."""
     from scipy.special import ndtr
 
     x = np.linspace(-9.0, 9.0, 4001)
@@ -27,7 +27,7 @@ def expected_range(count: int) -> float:
 
 
 def derive(records: Sequence[Record], settings: Settings) -> dict[str, Any]:
-    """What results.json holds besides the tasks: Table I, the cells of Tables II to V, convergence, summary."""
+    """The content of results.json besides the tasks: Table I, the cells of Tables II to V, convergence, summary."""
     cells = [
         cell(records, settings, experiment, sensor, parameter)
         for experiment in ("offline", "online")
@@ -39,7 +39,7 @@ def derive(records: Sequence[Record], settings: Settings) -> dict[str, Any]:
 
 
 def table1(records: Iterable[Record]) -> dict[str, Any] | None:
-    """Pose errors: mean over flights, least and largest flight; None without such tasks."""
+    """Pose errors: mean over flights, smallest and largest value of a flight; None without such tasks."""
     chosen = [r for r in records if r["experiment"] == "table1"]
     if not chosen:
         return None
@@ -63,7 +63,7 @@ def cell(records: Iterable[Record], settings: Settings, experiment: str, sensor:
     truth = (settings.mass, *settings.inertia)[column]
     paper = PUBLISHED_RANGES[experiment, sensor][parameter]
     mine = [r for r in records if r["experiment"] == experiment and r["sensor"] == sensor]
-    # offline the bound belongs to the flight, which both methods share; online each method flew its own
+    # offline both methods share the flight and its bound; online each method has its own flights
     limits = {r["seed"]: r for r in mine if r["method"] == "bound"}
     result: dict[str, Any] = {
         "table": table_of(experiment, parameter), "experiment": experiment, "sensor": sensor, "parameter": parameter,
@@ -94,7 +94,7 @@ def cell(records: Iterable[Record], settings: Settings, experiment: str, sensor:
 def _values(
     records: Sequence[Record], limits: Mapping[int, Record], column: int, experiment: str
 ) -> tuple[NDArray, list[Any], NDArray]:
-    """Values of a column, their intervals, and (n, 3) relative bounds with noise free, single and known."""
+    """Values of a column, their intervals, and (n, 3) relative bounds for noise free, single and known."""
     values, ci95, sds = [], [], []
     for record in records:
         found = record["windows"] if experiment == "online" else [{"value": record["final"], **record}]
@@ -109,7 +109,7 @@ def _values(
 
 
 def _curves(records: Sequence[Record], settings: Settings, column: int, paper: tuple[float, float]) -> dict[str, Any]:
-    """The other way to read a range off online curves: everything they pass through after 8 s."""
+    """A second definition of an online range: all values of the curves after 8 s."""
     first = round(SETTLED_SECONDS / (settings.dt * settings.every))
     values = [row[column] for r in records if not r["crashed"] for row in r["theta"][first:] if row[column] is not None]
     if not values:
@@ -164,7 +164,7 @@ def _digits(value: Any) -> float:
 
 
 def flights(records: Sequence[Record]) -> list[dict[str, Any]]:
-    """Online flights of each sensor and method: crashes, tracking, times to come near the truth."""
+    """Online flights of each sensor and method: crashes, tracking, convergence times."""
     found = []
     for sensor in SENSORS:
         for method in ("published", "crazyem"):
@@ -196,7 +196,7 @@ def flights(records: Sequence[Record]) -> list[dict[str, Any]]:
 
 
 def summary(cells: Sequence[Record]) -> dict[str, Any]:
-    """How well the paper is reproduced, and how good crazyem's estimates are."""
+    """Summary of the agreement with the paper, and of the quality of crazyem's estimates."""
     result: dict[str, Any] = {}
     published = [c for c in cells if c["published"] and c["published"]["n"] > 1]
     if published:
@@ -229,7 +229,7 @@ def summary(cells: Sequence[Record]) -> dict[str, Any]:
 
 
 def _widths(cells: Sequence[Record], key: str) -> dict[str, Any]:
-    """Width of the published method's ranges over the paper's; offline there is one reading only."""
+    """Width of the published method's ranges over the paper's width; offline with one definition of the range only."""
     ratios = {_name(c): c["published"].get(key) or c["published"]["width_ratio"] for c in cells}
 
     def mean(names: Sequence[str]) -> float | None:
