@@ -20,7 +20,7 @@ class FileFormatError(CrazyemError):
 
 
 class KnownFileError(FileFormatError):
-    """A file that is a known placeholder of a recording; the message says what the file is and what to do."""
+    """A file of a known kind that is no recording; the message says what the file is and what to do."""
 
 
 class LinkError(CrazyemError):

@@ -156,7 +156,7 @@ def _is_recording(path: Path, *, mapped: bool) -> bool:
     try:
         reader = reader_of(path)
     except KnownFileError:
-        # placeholders of recordings are kept, so that the user sees an error; other Git LFS pointers may be pictures
+        # a Git LFS pointer of a recording is kept, so that the user sees an error; other pointers may be pictures
         return path.name.lower().endswith(_RECORDING_SUFFIXES)
     except FileFormatError:
         # unknown format; a .csv.gz file may be a damaged recording and is kept, so that the user sees an error
