@@ -35,9 +35,7 @@ def plan(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Plan:
-    """Plan the most informative flight within limits. Nothing is flown.
-
-    `parameters`, `split` and `diagnosis` are goals; at most one is given.
+    """Plan the most informative flight within limits, without flying. One goal: `parameters`, `split` or `diagnosis`.
 
     Args:
         vehicle: the present model of the drone: a Vehicle, a preset's name or a file.

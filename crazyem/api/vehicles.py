@@ -233,8 +233,7 @@ def predict_ensemble(
         vehicle: with a posterior. count: number of draws.
         horizon: steps ahead. step: s each; None: the recorded samples.
         seed: of the draws.
-        days: add day-to-day variation of trim, thrust and lag. The band is far wider, because the recorded commands
-            compensate the trim of their own day.
+        days: add day-to-day variation of trim, thrust and lag: far wider, as recorded commands fit their day's trim.
         calibrate: other flights from which disturbances are learned; without them, the band covers constants only.
         plain: use the model alone, without correction by the flight before each start.
 
