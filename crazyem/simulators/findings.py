@@ -1,6 +1,5 @@
-"""Compare a simulator's file with flights, in the names and units of the file.
-
-A finding for each field; mass and thrust as alternatives, because flights identify only their ratio."""
+"""Compare a simulator's file with flights, in the file's names and units: a finding for each field, and alternatives
+for mass and thrust, because flights identify only their ratio."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -90,7 +89,6 @@ def field_findings(
         effects: of the diagnosis' document: name, and parameters with value and sd.
         not_identifiable: effect -> why flights give no information on it.
         looked_for: effects that the diagnosis tried; None: all.
-        tolerance: relative deviation up to which a number is not off.
     """
     old, new = from_vehicle(before)[0], from_vehicle(fitted)[0]
     moved = _moved(fitted, effects)

@@ -36,7 +36,7 @@ def _text(element: Element, tag: str, document: XmlDocument) -> str:
 
 
 def _motors(model: Element) -> list[int]:
-    """Which plugins are motors."""
+    """Indices of the motor plugins."""
     found = [k for k, p in enumerate(model.all("plugin")) if p.all("motorConstant")]
     return found if len(found) == 4 else []
 
@@ -45,7 +45,8 @@ def _motors(model: Element) -> list[int]:
 class _Parts:
     """Link indices of the body and of four propellers; their masses [kg], places [m] and inertias [kg m^2].
 
-    centre: of mass of the body [m]; places: (4, 3); middle: of these; own: (3, 3) of propellers, not about their axes.
+    centre: body's centre of mass [m]; places: (4, 3), middle: their mean; own: (3, 3) sum of the
+    propellers' inertias, 0 about their spin axes.
     """
 
     body: int
