@@ -117,10 +117,10 @@ def _table1(task: Task, settings: Settings) -> dict[str, Any]:
     error = flight.estimate - flight.truth
     record: dict[str, Any] = {}
     for name, columns in (("position", slice(0, 3)), ("angles", slice(6, 9))):
-        # of one axis each: sd over mean is printed as 0.755 = sqrt(pi / 2 - 1), as |Gaussian| numbers have it
+        # errors per axis: the printed sd over mean is 0.755 = sqrt(pi / 2 - 1), the ratio for |Gaussian| numbers
         size = np.abs(error[:, columns])
         record[name] = {"mean": short(size.mean()), "sd": short(size.std()), "max": short(size.max())}
-    # Fig. 5: what share of all components stays where the text says
+    # Fig. 5: share of all components inside the limits of the text
     record["velocity_within"] = short(np.mean(np.abs(error[:, 3:6]) < 3e-2))
     record["rate_within"] = short(np.mean(np.abs(error[:, 9:12]) < 0.15))
     return record

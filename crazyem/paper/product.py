@@ -1,9 +1,8 @@
 """The product's estimator on the paper's flights: the same `OnlineEstimator` as in flight, fed with samples.
 
 The estimator gets only information that a user has: thrust and torque are the inputs, the way the simulator steps
-(explicitly by eq. 56, unless it takes smaller steps than it samples), and whether there is an accelerometer. Parameters
-and noise stay unknown: the paper's cold start (eq. 116, 117) replaces the constants of the vehicle file, with a wide
-prior.
+(explicitly by eq. 56, unless it takes smaller steps than it samples), and whether there is an accelerometer. Noise and
+parameters stay unknown: the paper's cold start (eq. 116, 117) replaces the vehicle file's constants, with a wide prior.
 """
 
 import time
