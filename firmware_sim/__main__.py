@@ -54,7 +54,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the simulator until SIGINT or SIGTERM; 0 then, 2 after a mistake of the user, told in one sentence."""
+    """Run the simulator until SIGINT or SIGTERM. Returns 0 then, 2 after an error of the user (one sentence)."""
     arguments = _parser().parse_args(argv)
     try:
         if arguments.storage and (arguments.swarm is not None or arguments.mavlink is not None):
@@ -81,7 +81,7 @@ def _run(arguments: argparse.Namespace) -> None:
         raise FirmwareSimError(f"--seed must not be negative, it is {arguments.seed}")
     with contextlib.ExitStack() as stack:
         sock = stack.enter_context(contextlib.closing(bind(arguments.host, arguments.port)))
-        from firmware_sim.flight import Flight  # here: compiled code takes a while to load, a port in use should not
+        from firmware_sim.flight import Flight  # late: compiled code loads slowly, a port in use is told first
         from firmware_sim.scenario import load_scenario
         from firmware_sim.services.memory import Storage
 

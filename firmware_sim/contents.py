@@ -1,14 +1,14 @@
 """The tables of contents of the firmware of August 2026, in its order: names, types, flags, defaults of parameters.
 
-As read over the link from crazyflie-firmware 2a18fc29 (protocol 12, 354 log variables, 245 parameters) by cflib, on a
-build for a PC; flags as in its source (PARAM_ADD of each module). What a build for a drone has besides (rotor speeds of
-a brushless drone, decks, an application's own groups) is in no line here: tables.py sorts it in.
+Source: cflib read them over the link from crazyflie-firmware 2a18fc29 (protocol 12, 354 log variables, 245 parameters),
+built for a PC; flags from its source (PARAM_ADD of each module). A build for a drone has more: rotor speeds of a
+brushless drone, decks, groups of an application. tables.py adds these.
 """
 
 from dataclasses import dataclass
 from importlib import resources
 
-# Defaults that are other ones on a brushless drone.
+# Defaults that differ on a brushless drone.
 CF21BL = {
     "pid_rate.roll_kp": 200.0,
     "pid_rate.roll_ki": 400.0,

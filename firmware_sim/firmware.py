@@ -1,6 +1,6 @@
 """The firmware as one object: the flight, the commander and the services behind the CRTP ports.
 
-Knows no sockets and no real time: `receive` takes a packet, `advance` lets time pass, `outbox` holds what goes out.
+It has no sockets and no real time: `receive` takes a packet, `advance` lets time pass, `outbox` holds packets to send.
 """
 
 from collections import deque
@@ -25,8 +25,8 @@ from firmware_sim.services.param import ParamService
 from firmware_sim.services.ports import FIRMWARE_VERSION, PlatformService
 from firmware_sim.tables import Slot
 
-# Log variables that stand still here and are not 0 on the ground of a desk: rates [Hz] of the loops, and the state of
-# the complementary estimator, which does not run.
+# Log variables that are constant here and not 0 for a drone at rest: rates [Hz] of the loops, and the state of the
+# complementary estimator, which does not run.
 _CONSTANT_LOG = {
     "stabilizer.rtStab": 1000.0,
     "kalman.rtPred": 100.0,
@@ -40,7 +40,7 @@ _CONSTANT_LOG = {
 
 
 class FlightLike(Protocol):
-    """What the firmware needs of a flight (flight.Flight; tests bring their own)."""
+    """The part of a flight that the firmware uses (flight.Flight; tests have their own class)."""
 
     tick: int
     log: dict[str, Slot]
@@ -53,7 +53,7 @@ class FlightLike(Protocol):
     truth_header: ClassVar[list[str]]
 
     def truth_row(self) -> list[float]:
-        """What is true now, as truth_header names it."""
+        """The true state now, in the columns of truth_header."""
 
     def parameter_written(self, name: str) -> None:
         """A parameter of the flight has been written."""
@@ -72,11 +72,11 @@ class Firmware:
     """A drone that has booted at tick 0.
 
     Args:
-        flight: what flies.
+        flight: the simulated drone.
         platform: "cf2" or "cf21bl".
         seed: of the timers' jitter.
         parameters: boot values that replace defaults.
-        storage: what survives a reboot; its stored parameters replace boot values. None: empty.
+        storage: stored parameters, which survive a reboot and replace boot values. None: empty.
 
     Raises:
         ScenarioError: a boot value names no parameter.
@@ -105,7 +105,7 @@ class Firmware:
         own_param = tables.slots(boot | dict.fromkeys(tables.DECKS, 0.0))
         log = {**own_log, **self.supervisor.log, **flight.log}
         param = {**own_param, **self.supervisor.param, **self.high_level.param, **flight.param}
-        # A parameter that the flight has too must be the flight's everywhere.
+        # A parameter that the flight also has is the one of the flight everywhere.
         self.supervisor.param, self.high_level.param = param, param
         self._rates = (own_log["crtp.rxRate"], own_log["crtp.txRate"])
         self._packets = [0, 0]  # received and sent since the last update of the rates
@@ -171,7 +171,7 @@ class Firmware:
         self._console.append(text)
 
     def _flush_console(self) -> None:
-        """Console text goes out after the replies, and only once there is a client to hear it."""
+        """Send console text after the replies, and only when there is a client."""
         for text in self._console:
             for chunk in ports.text_chunks(text):
                 self._send(wire.encode(wire.CONSOLE, 0, chunk))
@@ -195,7 +195,7 @@ class Firmware:
         return self.flight.tick
 
     def next_event(self) -> int:
-        """The tick [ms] before which nothing leaves the firmware by itself."""
+        """The tick [ms] before which the firmware sends nothing of its own accord."""
         tick = self.flight.tick
         event = (tick // HIGH_LEVEL_PERIOD + 1) * HIGH_LEVEL_PERIOD
         due = self.log.next_due()

@@ -1,6 +1,6 @@
 """The flight: everything between the commander's setpoint and the log variables, one millisecond at a time.
 
-Owns the arrays that the compiled tick works on and shows them by name. Knows no packets and no real time.
+It owns the arrays of the compiled tick and gives access to them by name. It has no packets and no real time.
 """
 
 import math
@@ -28,7 +28,7 @@ CONTROLLERS = (1, 2, 3, 5, 6)
 
 
 class Flight:
-    """A drone with its flight controller. scenario: what is true; seed: of all noise (same seed, same flight)."""
+    """A drone with its flight controller. scenario: the truth; seed: of all noise (same seed, same flight)."""
 
     truth_header: ClassVar[list[str]] = [
         *("t", "px", "py", "pz", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "wx", "wy", "wz"),
@@ -39,7 +39,7 @@ class Flight:
         self.tick = 0
         self.setpoint = sp.null_setpoint()
         self.motors_allowed = True
-        self.flying = False  # as the supervisor says: the onboard estimate then leaves out what it does in the air
+        self.flying = False  # set by the supervisor; while False, the onboard estimate leaves out its model of flight
         self.armed = scenario.platform != "cf21bl"
         self._noise = NoiseSource(seed)
         self._truth = scenario.truth()
@@ -72,9 +72,9 @@ class Flight:
         self._compile()
 
     def _start_up(self, scenario: Scenario) -> None:
-        """Sensors settled and calibrated, estimate at its place: as after a boot on level ground."""
+        """Settle and calibrate the sensors and start the estimate at the true pose: as after a boot on level ground."""
         biases = self._noise.boot(4)
-        share = 0.5 * math.erfc(-biases[3] / math.sqrt(2.0))  # a number from 0 to 1: fixes keep a beat of their own
+        share = 0.5 * math.erfc(-biases[3] / math.sqrt(2.0))  # a number from 0 to 1: the phase of the position fixes
         self._truth[at.FIX_PHASE] = math.floor(share * self._truth[at.FIX_PERIOD])
         self._sensor[at.BIAS : at.BIAS + 3] = biases[:3] * self._truth[at.GYRO_BIAS : at.GYRO_BIAS + 3]
         if "gyro_bias" in scenario.effects:
@@ -86,14 +86,14 @@ class Flight:
         self._estimate[at.E_RESET] = 1.0
 
     def _design_lqg(self) -> None:
-        """New gains from the weights; weights that have no solution leave the old gains."""
+        """Compute the gains from the weights; without a solution the old gains stay."""
         weights = {n: float(self._param[parameters.PARAMETER_INDEX[f"ctrlLqg.{n}"]]) for n in parameters.LQG_WEIGHTS}
         gains = lqg.design(**weights)
         if gains is not None:
             self._memory[mem.LQG_GAIN_POS : mem.LQG_GAIN_POS + 8] = gains
 
     def parameter_written(self, name: str) -> None:
-        """Tell the flight that a parameter has been written: some take effect or are corrected at once."""
+        """React to a written parameter: some take effect or are corrected at once."""
         if name == "stabilizer.controller":
             index = parameters.CONTROLLER
             wanted = int(self._param[index])
@@ -131,7 +131,7 @@ class Flight:
             self._estimate[at.E_EXT_QUAT : at.E_EXT_QUAT + 4] = np.roll(q / norm, 1)
 
     def seen_pose(self) -> tuple[np.ndarray, np.ndarray]:
-        """What a positioning system without noise sees now: m, world; quaternion x, y, z, w, body to world."""
+        """Pose that a positioning system without noise measures now: m, world; quaternion x, y, z, w, body to world."""
         p: Any = np.empty(3)
         q: Any = np.empty(4)
         fix_pose(self._truth, self.state, self._sensor, self.tick, p, q)
@@ -147,7 +147,7 @@ class Flight:
         self.tick += 1
 
     def _arrays(self) -> tuple[np.ndarray, ...]:
-        """What the compiled tick works on, in its order."""
+        """The arguments of the compiled tick, in its order."""
         return (
             self._truth,
             self._board,
@@ -169,7 +169,7 @@ class Flight:
         self.truth_row()
 
     def truth_row(self) -> list[float]:
-        """What is true now, as truth_header names it: s, m, m/s, -, rad/s, N, N m, PWM 0..65535, V.
+        """The true state now, in the columns of truth_header: s, m, m/s, -, rad/s, N, N m, PWM 0..65535, V.
 
         Position and velocity of the geometric origin; force and torque (about the centre of mass) of the rotors.
         """

@@ -1,7 +1,7 @@
-"""`kernel`: numba's njit for this package, with a cache that notices edits in any file, not only in the function's own.
+"""`kernel`: numba's njit for this package, with a cache that becomes invalid when any file of the package changes.
 
-Numba stamps a cached function with the content of the file it is written in. Our kernels call kernels of
-other files and read index constants of other files, so an edit there would silently leave old machine code in use.
+Numba checks only the file that contains a cached function. Our kernels call kernels and read index constants of other
+files: after an edit there, numba alone would use old machine code.
 """
 
 import contextlib
@@ -23,6 +23,6 @@ def kernel(function: Any) -> Any:
     Division by zero gives infinity as in C, not an exception.
     """
     dispatcher: Any = njit(cache=True, nogil=True, error_model="numpy")(function)
-    with contextlib.suppress(AttributeError):  # private to numba; without it caching works, only less watchful
+    with contextlib.suppress(AttributeError):  # private to numba; without it the cache checks only the own file
         dispatcher._cache._cache_file._source_stamp = _STAMP
     return dispatcher

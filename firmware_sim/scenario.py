@@ -1,6 +1,6 @@
-"""The scenario: what is true about the simulated drone, from a TOML file. Never visible to the firmware's tables.
+"""The scenario: true properties of the simulated drone, from a TOML file. The firmware's tables never show them.
 
-Every key is listed in docs: firmware_sim.md with its default; a wrong one raises ScenarioError naming file and key.
+Every key is listed in docs: firmware_sim.md with its default; a wrong key raises ScenarioError naming file and key.
 """
 
 import math
@@ -66,7 +66,7 @@ class Battery:
 class Sensors:
     """Inertial sensors; densities per root hertz, counts of 16 bits (BMI088), bias sd per axis after calibration.
 
-    Gyro noise: 0.1 deg/s rms at 1 kHz, that of the flights of the real firmware in the shared recordings.
+    Gyro noise: 0.1 deg/s rms at 1 kHz, as in the shared recordings of the real firmware.
     """
 
     gyro_noise: float = key(math.radians(0.1) / math.sqrt(500.0), 0.0, 1.0)  # rad/s/sqrt(Hz)
@@ -75,7 +75,7 @@ class Sensors:
     gyro_bias_walk: float = key(math.radians(0.002), 0.0, 1.0)  # rad/s/sqrt(s)
     accelerometer_noise: float = key(190e-6 * GRAVITY, 0.0, 10.0)  # m/s^2/sqrt(Hz)
     accelerometer_resolution: float = key(24.0 / 32768 * GRAVITY, 0.0, 10.0)  # m/s^2, one count; 0: none
-    # Share of reports of rotor speed that cannot be read and are 65535: 191 of 263,764 in Busetto's flights.
+    # Share of unreadable reports of rotor speed (value 65535): 191 of 263,764 in Busetto's flights.
     rotor_speed_invalid: float = key(7e-4, 0.0, 1.0)
 
 
@@ -88,15 +88,14 @@ class Integration:
 
 @dataclass(frozen=True)
 class Estimator:
-    """The onboard estimate: its predictions, and the fixes of position (and attitude) that reach it without a host.
+    """The onboard estimate: its predictions, and its built-in fixes of position (and attitude).
 
-    PREDICT_RATE is that of estimator_kalman.c. Slip and rate of fixes: with these the logged attitude wanders against
-    the gyro (0.2 ms/s), and the estimator finds as much noise in the logged velocity (6 mm/s in figure 8), as in
-    flights of the real firmware.
+    Slip and rate of fixes reproduce two properties of flights of the real firmware: the logged attitude drifts against
+    the gyro by 0.2 ms/s, and the estimator finds a noise of 6 mm/s in the logged velocity in figure 8.
     """
 
     prediction_rate: float = key(100.0, 1.0, 1000.0)  # Hz, PREDICT_RATE of estimator_kalman.c
-    prediction_slip: float = key(0.002, 0.0, 1.0)  # share of predictions that come 1 ms late, and all after them
+    prediction_slip: float = key(0.002, 0.0, 1.0)  # share of predictions that are 1 ms late; each delays all later ones
     positioning: str = field(default="pose", metadata={"choices": ("pose", "position", "none")})
     rate: float = key(30.0, 1.0, 1000.0)  # Hz
     position_noise: float = key(0.001, 0.0, 1.0)  # m
@@ -105,7 +104,7 @@ class Estimator:
 
 @dataclass(frozen=True)
 class Start:
-    """Where the drone stands or hangs at boot."""
+    """Pose of the drone at boot."""
 
     position: tuple[float, ...] = key((0.0, 0.0, 0.0), -30.0, 30.0, (3,))
     velocity: tuple[float, ...] = key((0.0, 0.0, 0.0), -30.0, 30.0, (3,))
@@ -122,7 +121,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class Link:
-    """The radio: what becomes of log packets on their way down. Requests and their replies are never lost here."""
+    """The radio: losses of log packets on the way to the host. Requests and their replies are never lost here."""
 
     loss: float = key(0.0, 0.0, 0.99)  # share of log packets that never arrive
     burst: float = key(1.0, 1.0, 1000.0)  # packets lost in a row, mean
@@ -144,7 +143,7 @@ _TABLES = (*_SECTIONS, "parameters", "effects", "hidden", "payload")
 
 @dataclass(frozen=True)
 class Scenario:
-    """A whole scenario; without arguments the default: a cf2 with 2.1+ propellers that weighs what it should."""
+    """A whole scenario; by default a cf2 with 2.1+ propellers of nominal mass."""
 
     platform: str = "cf2"
     vehicle: Vehicle = field(default_factory=Vehicle)
@@ -162,12 +161,12 @@ class Scenario:
     payload: tuple[PayloadEvent, ...] = ()
 
     def body(self, events: int = 0) -> Body:
-        """The body that flies after the first `events` payload events: the vehicle's, with what changes its mass."""
+        """The body after the first `events` payload events: the vehicle's with its effects and payloads."""
         mass = _or(self.vehicle.mass, PLATFORMS[self.platform].mass)
         return loaded_body(mass, self.inertia(), self.effects, carried(self._load(), self.payload[:events]))
 
     def _load(self) -> list[PointMass]:
-        """What is carried from the start."""
+        """Payloads carried from the start."""
         p = self.effects.get("payload", {"mass": 0.0})
         return [(p["mass"], (p["x"], p["y"], p["z"]))] if p["mass"] > 0.0 else []
 
@@ -225,13 +224,13 @@ class Scenario:
         return c
 
     def payload_changes(self) -> PayloadChanges | None:
-        """What happens to the body in flight; None where nothing does."""
+        """Payload events in flight; None without any."""
         if not self.payload:
             return None
         return PayloadChanges(self.payload, [self.truth(n + 1) for n in range(len(self.payload))])
 
     def board(self) -> np.ndarray:
-        """The constants compiled into the platform's firmware, whatever is true."""
+        """The constants compiled into the platform's firmware; they do not depend on the true values."""
         b, platform = np.zeros(at.BOARD_SIZE), PLATFORMS[self.platform]
         b[at.B_ARM] = SQRT_HALF * platform.arm_length
         b[at.B_TORQUE_PER_THRUST] = platform.torque_per_thrust
@@ -263,7 +262,7 @@ class Scenario:
 
 
 def _bound(share: float) -> float:
-    """What standard normal numbers exceed in this share of cases."""
+    """The bound that a standard normal number exceeds with probability `share`."""
     ends = {0.0: math.inf, 1.0: -math.inf}
     return ends[share] if share in ends else NormalDist().inv_cdf(1.0 - share)
 
@@ -273,9 +272,9 @@ def _or(value: Any, default: Any) -> Any:
 
 
 def _contact(mass: float, arm: float, J: np.ndarray, step: float) -> tuple[float, float, float]:
-    """The floor's stiffness [rad/s], damping ratio and stick [1/s], no faster than steps of `step` s follow.
+    """The floor's stiffness [rad/s], damping ratio and stick [1/s], slow enough for steps of `step` s.
 
-    A foot feels the body's inertia about the opposite edge, so rocking is faster than heaving by `rocking`.
+    A foot moves the body's inertia about the opposite edge, so rocking is faster than vertical motion by `rocking`.
     """
     rocking = max(1.0, mass * arm * arm / float(np.linalg.eigvalsh(J)[0]))
     fast, damped = 0.4 / step, 0.25 / step
@@ -293,7 +292,7 @@ def load_scenario(path: Path | None) -> Scenario:
 def parse_scenario(table: dict[str, Any], source: str, folder: Path | None = None) -> Scenario:
     """Check a scenario's table and build it; source names the file in messages. Raises ScenarioError.
 
-    folder: what a relative vehicle_file starts from (without it, the working directory).
+    folder: base of a relative vehicle_file (default: the working directory).
     """
     platform = table.get("platform", "cf2")
     if not isinstance(platform, str) or platform not in PLATFORMS:
@@ -327,7 +326,7 @@ def parse_scenario(table: dict[str, Any], source: str, folder: Path | None = Non
 
 
 def _of_vehicle_file(scenario: Scenario, value: Any, source: str, folder: Path) -> Scenario:
-    """The scenario with a vehicle file's constants and effects, which the scenario's own keys then override."""
+    """The scenario with constants and effects of a vehicle file; the scenario's own keys override them later."""
     if not isinstance(value, str):
         raise ScenarioError(f"{source}: vehicle_file must be the path of a vehicle file, not {value!r}")
     path = folder / value
@@ -387,7 +386,7 @@ def _parameters(table: dict[str, Any], source: str) -> dict[str, float]:
 
 
 def _check_body(scenario: Scenario, source: str) -> None:
-    """An inertia matrix no body can have is an error of the file."""
+    """Raises ScenarioError for an inertia matrix that no body can have."""
     if scenario.vehicle.inertia is not None:
         _check_inertia(scenario.inertia(), f"{source}: vehicle.inertia")
     changed = [name for name in ("inertia", "inertia_products") if name in scenario.effects]

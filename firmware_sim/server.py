@@ -1,6 +1,6 @@
 """The UDP server: one client at a time, real time (or a multiple of it), and nothing but CRTP datagrams.
 
-Replies are never dropped, because cflib asks only once; log packets are, when the socket would block.
+Replies are never dropped, because cflib asks only once. Log packets are dropped when the socket would block.
 """
 
 import contextlib
@@ -17,8 +17,8 @@ from firmware_sim.firmware import Firmware
 from firmware_sim.wire import Air
 
 _BUFFER = 1 << 20  # bytes, both ways: a client reads its whole table of contents in bursts
-# When the host stalls, the drone's time may fall behind by that much and catches up; beyond, it stands still instead of
-# racing. Kept below the 500 ms after which the setpoint watchdog takes a client for dead.
+# Largest delay of the drone's time behind the host's that is caught up after a stall; a longer delay is skipped. Below
+# the 500 ms after which the setpoint watchdog regards a client as dead.
 _MAX_BEHIND_HOST, _MAX_BEHIND_FIRMWARE = 250.0, 300.0  # ms of host time, ms of firmware time
 _CHUNK_MS = 20  # ms of firmware time between two looks at the socket
 _TRUTH_PERIOD = 10  # ms between rows of the truth file
@@ -83,7 +83,7 @@ class Server:
         self._zero, self._epoch = 0, 0.0
 
     def run(self) -> None:
-        """Serve until `stopping` is set (a signal handler does)."""
+        """Serve until a signal handler sets `stopping`."""
         with selectors.DefaultSelector() as selector:
             selector.register(self._sock, selectors.EVENT_READ)
             self.begin()
@@ -95,16 +95,16 @@ class Server:
                 selector.select(max(due - time.monotonic(), 0.0))
 
     def begin(self) -> None:
-        """Time goes on from here."""
+        """Start the clock at the present tick."""
         self._zero, self._epoch = self.firmware.flight.tick, time.monotonic()  # this tick belongs to this time
 
     def turn(self, next_event: Callable[[], int]) -> float:
-        """Let pass what is due, at most a chunk of it; receive and send.
+        """Advance the drone by the time that is due, at most a chunk; receive and send.
 
         Args:
-            next_event: the tick [ms] at which to come again.
+            next_event: gives the tick [ms] of the next turn.
 
-        Returns: host time (monotonic, s) of the next turn, 0 if there is more to do at once.
+        Returns: host time (monotonic, s) of the next turn, 0 for a turn at once.
         """
         flight = self.firmware.flight
         most = min(_MAX_BEHIND_HOST * self._speed, _MAX_BEHIND_FIRMWARE) + _CHUNK_MS
@@ -123,7 +123,7 @@ class Server:
 
     @property
     def wanted(self) -> int:
-        """What of the socket is to be waited for (`selectors`)."""
+        """Events of the socket to wait for (`selectors`)."""
         return selectors.EVENT_READ | (selectors.EVENT_WRITE if self._pending else 0)
 
     def _advance(self, milliseconds: int) -> None:
@@ -136,7 +136,7 @@ class Server:
             self._truth.update()
 
     def _receive_all(self) -> None:
-        """Handle every datagram that has arrived, at most a burst at a time so that the flight goes on."""
+        """Handle the datagrams that have arrived, at most a burst at a time: the flight must go on."""
         for _ in range(256):
             try:
                 datagram, sender = self._sock.recvfrom(2048)
@@ -157,7 +157,7 @@ class Server:
             self._transmit()
 
     def _adopt(self, sender: Address) -> None:
-        """A new client: there is no hello and no goodbye, its first packet makes it the client."""
+        """Make the sender the client: its first packet does so, because CRTP has no start or end of a session."""
         self.client = sender
         self.firmware.outbox.clear()  # log packets for the old client
         self._pending.clear()
@@ -186,6 +186,6 @@ class Server:
             self._sock.sendto(datagram, self.client)
         except BlockingIOError:
             return False
-        except OSError:  # the client's host cannot be reached: as good as lost in the air
+        except OSError:  # the client's host cannot be reached: the packet is lost
             return True
         return True

@@ -1,4 +1,4 @@
-"""Many simulated drones in one process: a port, a scenario, a place and a seed each; none knows of the others.
+"""Independent simulated drones in one process: a port, a scenario, a place and a seed each.
 
 Either `--swarm N` (the same scenario N times, on a grid), or a TOML file:
 
@@ -51,7 +51,7 @@ class Drone:
     yaw: float | None = None
 
     def load(self) -> "Scenario":
-        """Its scenario, put to its place. Raises ScenarioError."""
+        """The scenario with this drone's position and yaw. Raises ScenarioError."""
         from firmware_sim.scenario import load_scenario  # here: brings compiled code
 
         scenario = load_scenario(self.scenario)
@@ -72,9 +72,9 @@ def grid(number: int, count: int) -> tuple[float, float, float]:
 
 
 def of_number(count: int, *, port: int, seed: int, scenario: Path | None = None) -> list[Drone]:
-    """So many of the same drone, on ports `port`, `port` + 1, ... (0: any free ones), seeds `seed`, `seed` + 1, ...
+    """`count` equal drones on ports `port`, `port` + 1, ... (0: any free ones), with seeds `seed`, `seed` + 1, ...
 
-    Raises: ScenarioError for a number or a port that cannot be.
+    Raises: ScenarioError for an impossible number or port.
     """
     if not 1 <= count <= MOST_DRONES:
         raise ScenarioError(f"a swarm has 1 to {MOST_DRONES} drones, not {count}")
@@ -87,7 +87,7 @@ def of_number(count: int, *, port: int, seed: int, scenario: Path | None = None)
 
 
 def of_file(path: Path, *, port: int, seed: int, scenario: Path | None = None) -> list[Drone]:
-    """The drones of a swarm file; what it leaves out is as in `of_number`. Raises ScenarioError naming file and key."""
+    """The drones of a swarm file, with defaults as in `of_number`. Raises ScenarioError naming file and key."""
     table = read_toml(path)
     entries = table.pop("drone", None)
     if table:
@@ -135,7 +135,7 @@ def _drone(entry: dict[str, Any], where: str, base: Drone, folder: Path) -> Dron
             raise ScenarioError(f"{where}: position must be 3 numbers, not {place!r}")
         values["position"] = tuple(_metres(v, f"{where}: position", 30.0) for v in place)
     elif "scenario" in entry:
-        values["position"] = None  # the file's own; on the grid only what would stand on one place
+        values["position"] = None  # that of the scenario file; the grid is for drones that would share a place
     if "yaw" in entry:
         values["yaw"] = _metres(entry["yaw"], f"{where}: yaw", math.pi)
     return replace(base, **values)
@@ -148,10 +148,10 @@ def _metres(value: Any, where: str, most: float) -> float:
 
 
 class Swarm:
-    """Servers of several drones, in one thread: each gets its turn when its drone has something to send or receive.
+    """Servers of several drones in one thread: each has a turn when its drone has something to send or receive.
 
     Args:
-        servers: bound; each with its own speed and noise.
+        servers: with bound sockets; each has its own speed and noise.
     """
 
     def __init__(self, servers: Sequence[Server], sockets: Sequence[socket.socket]) -> None:
@@ -159,15 +159,15 @@ class Swarm:
         self.stopping = False
 
     def run(self) -> None:
-        """Serve until `stopping` is set (a signal handler does)."""
+        """Serve until a signal handler sets `stopping`."""
         with selectors.DefaultSelector() as selector:
             for number, sock in enumerate(self._sockets):
                 selector.register(sock, selectors.EVENT_READ, number)
                 self.servers[number].begin()
             dues: list[tuple[float, int]] = [(0.0, n) for n in range(len(self.servers))]
-            newest = [0.0] * len(self.servers)  # the entry of `dues` that counts
+            newest = [0.0] * len(self.servers)  # the valid entry of each drone in `dues`
             while not self.stopping:
-                # Those that are due, then those that hear something: a chatty client cannot hold up the others' time.
+                # First the drones that are due, then those with packets: a busy client must not delay the others.
                 now = time.monotonic()
                 turns = []
                 while dues and dues[0][0] <= now:
@@ -191,16 +191,16 @@ class Swarm:
 
 
 def _next(firmware: Firmware) -> int:
-    """The tick of the next log packet; what happens inside between two of them needs no turn of its own."""
+    """The tick of the next turn: of the next log packet, at most LONGEST_PAUSE away; other events need no turn."""
     tick = firmware.flight.tick
     due = firmware.log.next_due()
     return tick + LONGEST_PAUSE if due is None else min(max(due, tick + 1), tick + LONGEST_PAUSE)
 
 
 def open_swarm(drones: Sequence[Drone], stack: contextlib.ExitStack, *, host: str, speed: float) -> Swarm:
-    """Sockets bound and drones booted; `stack` closes the sockets. Raises ServerError, ScenarioError."""
+    """Bind the sockets and boot the drones; `stack` closes the sockets. Raises ServerError, ScenarioError."""
     sockets = [stack.enter_context(contextlib.closing(bind(host, drone.port))) for drone in drones]
-    from firmware_sim.flight import Flight  # here: compiled code takes a while to load, a port in use should not
+    from firmware_sim.flight import Flight  # late: compiled code loads slowly, a port in use is told first
 
     servers = []
     for drone, sock in zip(drones, sockets, strict=True):

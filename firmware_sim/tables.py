@@ -1,7 +1,7 @@
 """The tables of contents of log variables and parameters, their storage types, and values in and out of bytes.
 
 Types and flags are those of the real tables (contents.py); type bytes and conversions as in crazyflie-firmware (log.h,
-param.h, log.c). A name that no table lists is a float, which most of the firmware's variables are.
+param.h, log.c). A name in no table is a float, as most of the firmware's variables.
 """
 
 import math
@@ -14,7 +14,7 @@ import numpy as np
 
 from firmware_sim import contents
 
-Slot = tuple[np.ndarray, int]  # where a value lives: a float64 array and an index into it
+Slot = tuple[np.ndarray, int]  # place of a value: a float64 array and an index into it
 
 LOG_TYPE = {"u8": 1, "u16": 2, "u32": 3, "i8": 4, "i16": 5, "i32": 6, "float": 7, "fp16": 8}
 PARAM_TYPE = {"u8": 0x08, "u16": 0x09, "u32": 0x0A, "i8": 0x00, "i16": 0x01, "i32": 0x02, "float": 0x06}
@@ -25,9 +25,9 @@ LOG_TYPE_NAME = {code: name for name, code in LOG_TYPE.items()}
 PARAM_READ_ONLY, PARAM_CORE, PARAM_EXTENDED = 0x40, 0x20, 0x10
 MAX_NAME = 24  # len(group) + len(name), so that a table item fits a packet
 
-# What a drone has that the build for a PC (contents.py) has not. Any other name is a float.
+# Variables of a drone that the build for a PC (contents.py) lacks. Any other name is a float.
 _LOG_EXTRA = dict.fromkeys((f"motor.m{n}_rpm" for n in range(1, 5)), "u16")
-DECKS = tuple(  # cfclient cannot do without the group
+DECKS = tuple(  # cfclient needs this group
     f"deck.{name}"
     for name in ("bcZRanger", "bcZRanger2", "bcFlow", "bcFlow2", "bcLighthouse4", "bcLoco", "bcDWM1000", "bcLedRing")
 )
@@ -83,7 +83,7 @@ class Table:
 
 
 def _grouped(slots: Mapping[str, Slot]) -> list[str]:
-    """Names with each group contiguous, groups in order of first appearance, as the linker lays the real tables out."""
+    """Names with each group contiguous, groups in order of first appearance, as in the real tables."""
     order = {group: n for n, group in enumerate(dict.fromkeys(name.split(".", 1)[0] for name in slots))}
     for name in slots:
         if len(name) - 1 > MAX_NAME:
@@ -111,7 +111,7 @@ def param_table(slots: Mapping[str, Slot]) -> Table:
 
 
 def to_int32(value: float) -> int:
-    """C conversion of a float to int32: truncation; the ARM core saturates, and turns NaN into 0."""
+    """C conversion of a float to int32 on an ARM core: truncation, saturation, NaN to 0."""
     if math.isnan(value):
         return 0
     return max(-(2**31), min(2**31 - 1, int(value))) if math.isfinite(value) else (2**31 - 1 if value > 0 else -(2**31))

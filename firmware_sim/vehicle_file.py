@@ -1,8 +1,8 @@
 """A vehicle file as the truth of a scenario: `vehicle_file = "PATH.toml"`, the format in which crazyem keeps drones.
 
 TOML, SI: name, mass, inertia (3 or 6), arm (one number or [x, y]), thrust_curve (1 to 6 coefficients, constant first),
-rotor_constant, torque_per_thrust, motor_time_constant, thrust_max (inf: no limit), battery_compensated and *_sd (of no
-meaning here), and tables [effects.NAME]. mass and inertia are required. What the file leaves out stays the platform's.
+rotor_constant, torque_per_thrust, motor_time_constant, thrust_max (inf: no limit), battery_compensated and *_sd (not
+used here), and tables [effects.NAME]. mass and inertia are required. Other missing values are the platform's.
 """
 
 import tomllib
@@ -12,7 +12,7 @@ from typing import Any
 from firmware_sim.errors import ScenarioError
 
 LARGEST_VEHICLE_FILE = 1 << 20  # bytes; such a file has a few hundred
-NO_LIMIT = 100.0  # N per rotor, what a thrust_max of inf becomes
+NO_LIMIT = 100.0  # N per rotor, in place of a thrust_max of inf
 _VEHICLE = (
     *("mass", "inertia", "arm", "thrust_curve", "rotor_constant"),
     *("torque_per_thrust", "motor_time_constant", "thrust_max"),
@@ -36,7 +36,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def vehicle_tables(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What a vehicle file says, as the tables [vehicle] and [effects] of a scenario, not yet checked for range.
+    """The content of a vehicle file as tables [vehicle] and [effects] of a scenario, not yet checked for range.
 
     Raises ScenarioError naming the file and the key.
     """

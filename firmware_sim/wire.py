@@ -1,4 +1,4 @@
-"""CRTP packets on the wire, `[header][0..30 data bytes]` in a UDP datagram; and the air, which loses some of them.
+"""CRTP packets on the wire, `[header][0..30 data bytes]` in a UDP datagram; and a model of their losses.
 
 header = port << 4 | 0b11 << 2 | channel. Source: crazyflie-firmware docs/functional-areas/crtp, cflib crtpstack.py.
 """
@@ -14,11 +14,11 @@ SUPERVISOR, PLATFORM, LINK = 9, 13, 15
 
 PROTOCOL_VERSION = 12
 
-# errno values as newlib numbers them (what the firmware puts on the wire).
+# errno values of newlib, as the firmware sends them.
 ENOENT, EIO, E2BIG, ENOEXEC, ENOMEM, EACCES, EBUSY, EEXIST, EINVAL = 2, 5, 7, 8, 12, 13, 16, 17, 22
 
 SCAN_PROBE = b"\xff"
-IGNORED = (b"\xf3", b"\xf4")  # hello and goodbye of older forks of cflib: no session begins or ends with them
+IGNORED = (b"\xf3", b"\xf4")  # start and end packets of older forks of cflib; they have no effect
 
 
 class Packet(NamedTuple):
@@ -30,7 +30,7 @@ class Packet(NamedTuple):
 
     @property
     def is_null(self) -> bool:
-        """True for link-layer null packets (port 15, channel 3), which carry nothing and make nobody the client."""
+        """True for link-layer null packets (port 15, channel 3): empty, and their sender does not become client."""
         return self.port == LINK and self.channel == 3
 
 
@@ -52,7 +52,7 @@ def decode(datagram: bytes) -> Packet | None:
 
 
 class Air:
-    """Says of each log packet whether it is lost (Gilbert's model: a good and a bad state, all lost in the bad one).
+    """Decides for each log packet whether it is lost (Gilbert's model: a bad state loses all, a good state none).
 
     Args:
         loss: share of packets lost in the long run, 0 <= loss < 1.
@@ -66,7 +66,7 @@ class Air:
         # Leaving the bad state has probability 1/burst; entering it is set by the share of time spent there.
         self._leave = 1.0 / burst
         self._enter = min(1.0, self._leave * loss / (1.0 - loss))
-        if self._enter == 1.0:  # bursts so short that even entering at once loses too little
+        if self._enter == 1.0:  # the bursts are too short for this loss: leave the bad state more slowly
             self._leave = (1.0 - loss) / loss
         self._random = random.Random(seed)
         self._bad = False

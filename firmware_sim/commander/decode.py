@@ -81,7 +81,7 @@ def _altitude_hold(out: np.ndarray, data: bytes, sign: float) -> None:
 
 
 def _full_state(out: np.ndarray, data: bytes, _sign: float) -> None:
-    """mm, mm/s, mm/s^2, compressed quaternion, milliradians per second (whatever cflib's docstring says)."""
+    """mm, mm/s, mm/s^2, compressed quaternion, milliradians per second (cflib's docstring is wrong)."""
     values = struct.unpack("<9hI3h", data)
     out[sp.MODE_X] = out[sp.MODE_Y] = out[sp.MODE_Z] = sp.ABSOLUTE
     out[sp.X : sp.AZ + 1] = np.array(values[:9]) / 1000.0
@@ -126,7 +126,7 @@ _DECODERS: dict[int, tuple[Callable[[np.ndarray, bytes, float], None], float, in
 def decode_generic(kind: int, data: bytes) -> np.ndarray | None:
     """The setpoint of a generic packet, data without the type byte; None for an unknown type or a wrong length.
 
-    (The firmware stops with a failed assertion on a wrong length; ignoring the packet serves a simulator better.)
+    (On a wrong length the firmware stops with a failed assertion; the simulator ignores the packet.)
     """
     out = sp.null_setpoint()
     if kind == STOP:

@@ -103,7 +103,7 @@ class Planner:
         self.last = at_rest(_ZERO, 0.0)
 
     def set_state(self, position: Vector, velocity: Vector, yaw: float) -> None:
-        """The estimated state [m, m/s, rad]: plans start here unless one is being flown."""
+        """Set the estimated state [m, m/s, rad], where a plan starts unless another is being flown."""
         self.last = at_rest(position, yaw, velocity)
 
     def stop(self) -> None:
@@ -111,7 +111,7 @@ class Planner:
         self.state = PlannerState.IDLE
 
     def disable(self) -> None:
-        """An evaluation was not a number: forget the plan and give no setpoints."""
+        """Delete the plan and give no setpoints (after an evaluation that is not a number)."""
         self.state = PlannerState.DISABLED
 
     @property

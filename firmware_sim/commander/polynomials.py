@@ -1,4 +1,4 @@
-"""Polynomial trajectories: seventh-order segments in x, y, z and yaw, and what a drone does on them.
+"""Polynomial trajectories: seventh-order segments in x, y, z and yaw, and the motion of a drone on them.
 
 A polynomial is 8 coefficients, constant first. Positions in m (world), yaw in rad, time in s. Plain Python: one
 evaluation per 10 ms needs no arrays. Source: crazyflie-firmware pptraj.c, pptraj_compressed.c; flatness after Mellinger
@@ -17,7 +17,7 @@ Polynomial = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Where a trajectory is: position .. jerk [m .. m/s^3, world], yaw [rad], body rates omega [rad/s]."""
+    """A point of a trajectory: position .. jerk [m .. m/s^3, world], yaw [rad], body rates omega [rad/s]."""
 
     position: Vector
     velocity: Vector

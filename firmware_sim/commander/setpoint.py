@@ -1,4 +1,4 @@
-"""The setpoint that the commander hands to the controllers, and who may set it (crazyflie-firmware commander.c).
+"""The setpoint of the controllers, and the priorities of its sources (crazyflie-firmware commander.c).
 
 It is one flat float64 array, so that compiled code can read it. Its layout follows `setpoint_t` of the firmware
 (stabilizer_types.h); each constant below is an index into the array.
@@ -36,7 +36,7 @@ def null_setpoint() -> np.ndarray:
     return setpoint
 
 
-NO_SETPOINT, HIGH_LEVEL, CRTP = 0, 1, 2  # priorities of whoever sends setpoints (commander.c)
+NO_SETPOINT, HIGH_LEVEL, CRTP = 0, 1, 2  # priorities of the sources of setpoints (commander.c)
 
 
 class Arbiter:
@@ -57,7 +57,7 @@ class Arbiter:
         return self._priority == NO_SETPOINT
 
     def offer(self, setpoint: np.ndarray, priority: int, tick: int) -> bool:
-        """Take the setpoint if its priority is at least the current one; tells whether it was taken."""
+        """Take the setpoint if its priority is at least the current one; returns whether it was taken."""
         if priority < self._priority:
             return False
         self.setpoint, self.stamp, self._priority = setpoint, tick, priority

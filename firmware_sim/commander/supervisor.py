@@ -1,6 +1,7 @@
-"""The supervisor: may the motors run? Arming, tumble, watchdogs, emergency stop (crazyflie-firmware supervisor.c).
+"""The supervisor decides whether the motors may run (crazyflie-firmware supervisor.c).
 
-Runs at 25 Hz. States and their transitions as in supervisor_state_machine.c, one transition an update.
+It handles arming, tumble, watchdogs and emergency stop at 25 Hz, with states and transitions as in
+supervisor_state_machine.c, one transition an update.
 """
 
 import math
@@ -72,14 +73,14 @@ class Supervisor:
         self._auto_arm, self._clock, self._console = auto_arm, clock, console
         self.state = State.NOT_INITIALISED
         self.armed = self.crashed = self.tumbled = self.stopped = False
-        self.planner_bits = 0  # bits 8..10 of the information, set by whoever owns the planner
+        self.planner_bits = 0  # bits 8..10 of the information, set by the owner of the planner
         self._tumble_since: int | None = None
         self._thrust_at: int | None = None
         self._watchdog_at: int | None = None
         self._entered = 0  # tick of the last change of state
         self._spun_since: int | None = None
 
-    # What clients ask for.
+    # Requests of clients.
 
     def request_arming(self, arm: bool) -> bool:
         """Arm or disarm; arming works only when the pre-flight checks have passed."""
@@ -90,7 +91,7 @@ class Supervisor:
         return True
 
     def request_recovery(self) -> bool:
-        """Leave the crashed state, which a drone that still lies on its back cannot."""
+        """Leave the crashed state; impossible while the drone lies on its back."""
         if self.crashed and self.tumbled:
             return False
         self.crashed = False
@@ -104,7 +105,7 @@ class Supervisor:
         """Start or feed the watchdog: without the next notification within a second the motors stop for good."""
         self._watchdog_at = self._clock()
 
-    # What the rest of the firmware asks.
+    # Queries of the rest of the firmware.
 
     @property
     def motors_allowed(self) -> bool:
@@ -137,7 +138,7 @@ class Supervisor:
         return sum(1 << n for n, bit in enumerate(bits) if bit) | self.planner_bits
 
     def override(self, setpoint: np.ndarray) -> np.ndarray:
-        """The setpoint the controller gets: as it is, levelled out when it has gone stale, or null."""
+        """The setpoint for the controller: unchanged, levelled out when stale, or null."""
         if self.state in {State.READY, State.FLYING, State.LANDED}:
             return setpoint
         if self.state != State.LEVEL_OUT:

@@ -12,7 +12,7 @@ from firmware_sim.plant.quaternion import roll_pitch_yaw
 
 @kernel
 def desired_yaw(setpoint, estimate, dt):
-    """Yaw in rad that the setpoint asks for: a rate moves it on from the present yaw, quaternions carry their own."""
+    """Desired yaw [rad]: given, from the quaternion, or the present yaw plus the rate times dt."""
     if setpoint[sp.MODE_YAW] == sp.VELOCITY:
         _, _, yaw = roll_pitch_yaw(estimate, at.E_QUAT)
         return yaw + math.radians(setpoint[sp.RATE_YAW]) * dt
@@ -44,7 +44,7 @@ def position_error(setpoint, estimate, axis, yaw):
 
 @kernel
 def any_absolute(setpoint):
-    """Does the setpoint give a place along any axis?"""
+    """Whether the setpoint gives a position along any axis."""
     return (
         setpoint[sp.MODE_X] == sp.ABSOLUTE or setpoint[sp.MODE_Y] == sp.ABSOLUTE or setpoint[sp.MODE_Z] == sp.ABSOLUTE
     )
@@ -111,7 +111,7 @@ def angles(D):
 
 @kernel
 def desired_rate(setpoint, mass, thrust, R, D, wr):
-    """wr (3, rad/s, body): the body rate the wanted rotation D turns with, from jerk and yaw rate, seen from R.
+    """wr (3, rad/s): the rate of the desired rotation D from jerk and yaw rate, in the body axes of R.
 
     Thrust [N] over mass [kg] is the acceleration along body z (Mellinger and Kumar 2011, h_omega).
     """

@@ -51,7 +51,7 @@ def log_estimate(sensor, estimate, P, log):
 
 @kernel
 def log_inertial(sensor, log):
-    """gyro.*, acc.*: never late with the estimate."""
+    """gyro.*, acc.*: without the delay of a delayed estimate."""
     for i in range(3):
         log[lv.GYRO + i] = math.degrees(sensor[at.GYRO + i])
         log[lv.ACC + i] = sensor[at.ACCEL + i] / GRAVITY
@@ -81,7 +81,7 @@ TEMPERATURE = 25.0  # degC
 
 @kernel
 def log_baro(state, noise, tick, log):
-    """baro.*: height over the sea, of a floor at its level, temperature and pressure."""
+    """baro.*: height above sea level (world height 0 is sea level), temperature and pressure."""
     if tick % BARO_PERIOD == 0:
         height = state[at.POS + 2] + BARO_NOISE * noise[at.N_BARO]
         log[lv.BARO] = height
@@ -106,7 +106,7 @@ def log_setpoint(setpoint, log):
 
 @kernel
 def log_control(memory, param, log, union_float, union_short):
-    """What control_t's union shows: the PWM thrust in legacy mode, else torque y (and half of torque x) by accident."""
+    """Values read from control_t's union: the PWM thrust in legacy mode, else torque y and half of torque x."""
     for i in range(6):
         log[lv.LEE_GAINS + i] = param[(pm.LEE_KR if i < 3 else pm.LEE_KW - 3) + i]
         log[lv.LEE_GAINS + 6 + i] = param[(pm.LEE_KP if i < 3 else pm.LEE_KD - 3) + i]
@@ -119,9 +119,9 @@ def log_control(memory, param, log, union_float, union_short):
         log[lv.PID_CTR_YAW] = memory[mem.LEGACY + 3]
 
 
-# Idling rotors are slower than the thrust curve, drawn on below the firmware's least thrust, makes them. Busetto's data
+# Idling rotors are slower than by the thrust curve, extrapolated below the firmware's least thrust. Busetto's data
 # (arXiv 2512.14450): 11 stretches at rest, duty 0.1526, 3.4 to 4.1 V, 0.47 to 0.64 of the least thrust by the curve.
-IDLE_SPEED = 0.90  # of the curve's; sd 0.006
+IDLE_SPEED = 0.90  # share of the curve's speed; sd 0.006
 IDLE_UP_TO = 0.64  # of the least thrust
 RPM_UNREADABLE = 65535.0  # MOTORS_RPM_INVALID: no report yet, or one with a wrong checksum
 

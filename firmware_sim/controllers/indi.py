@@ -2,12 +2,12 @@
 
     alpha_ref = ref_rate (ref_err (angle error) - rate);  du = (alpha_ref - d(rate_f)/dt) / g1;  u = u_f + du
 
-rate_f and u_f passed the same low pass; u_f is what the rotors, with a lag of act_dyn a step, made of the last u. So g1
-[rad/s^2 a unit] is the control effectiveness, and g1 too small is a loop gain too high. Yaw has g2 besides: what the
-rotors' own inertia adds to a step of the command (Smeur, Chu, de Croon 2016, eq. 36). Axes: x forward, y right, z down.
-The outer loop is in indi_position.py. Copied with the rest: a heading by rate is in degrees and in radians at once, so
-the heading goes to 0 within two steps; r_pitch and r_yaw of the log are the roll rate; the position loop of PID, with
-outerLoopActive = 0, gives degrees where radians are read.
+rate_f and u_f pass the same low pass; u_f is the last u after the rotors' lag (act_dyn a step). g1 [rad/s^2 a unit] is
+the control effectiveness: g1 too small is a loop gain too high. Yaw has g2, too: the part of the rotors' own inertia in
+a step of the command (Smeur, Chu, de Croon 2016, eq. 36). Axes: x forward, y right, z down. The outer loop is in
+indi_position.py. Errors of the firmware that are kept: a heading by rate mixes degrees and radians, so the heading goes
+to 0 within two steps; r_pitch and r_yaw of the log are the roll rate; with outerLoopActive = 0 the position loop of PID
+gives degrees where radians are read.
 """
 
 import math
@@ -31,7 +31,7 @@ POSITION_CUTOFF = 8.0  # Hz, POSITION_INDI_FILT_CUTOFF
 
 @kernel
 def reset(param, memory):
-    """As controllerINDIInit: filters empty and with their present cut-off, no command; thrust goes on."""
+    """As controllerINDIInit: empty filters with their present cut-off, no command; the thrust is kept."""
     for i in range(mem.INDI_FILTERS, mem.INDI_FILTERS_END):
         memory[i] = 0.0
     design(memory, mem.INDI_TILT, param[pm.INDI_CUTOFF], RATE)

@@ -1,8 +1,8 @@
-"""INDI's outer loop, as in position_controller_indi.c: place -> velocity -> acceleration -> increments of tilt, thrust.
+"""INDI's outer loop, as in position_controller_indi.c: position -> velocity -> acceleration -> steps of tilt, thrust.
 
-G [roll, pitch, T] = acceleration that is missing, with G the derivative of the thrust's acceleration by roll and pitch
-(at hover) and by thrust. K_THR [m/s^2 a unit] is compiled in: a drone of another mass only has another loop gain.
-Axes: x forward, y right, z down. A place's velocity and acceleration are ignored, and velocities count as the world's.
+G [roll, pitch, T] = acceleration error, where G is the derivative of the thrust's acceleration by roll and pitch (at
+hover) and by thrust. K_THR [m/s^2 a unit] is a constant of the firmware: another mass gives another loop gain. Axes:
+x forward, y right, z down. Velocity and acceleration of a position setpoint are ignored; velocities are in world axes.
 Both loops filter by filter.h, init_butterworth_2_low_pass, direct form I.
 """
 
@@ -42,7 +42,7 @@ def butterworth(memory, c, o, value):
 
 
 K_THR = 0.00024730  # m/s^2 a unit of thrust
-ACT_DYN = 0.03149  # of the thrust, a step; ctrlINDI.act_dyn_* does not reach it
+ACT_DYN = 0.03149  # rotor lag of the thrust, a step; independent of ctrlINDI.act_dyn_*
 MAX_THRUST = 60000.0
 
 
@@ -63,7 +63,7 @@ def axes(f, M, G):
 
 @kernel
 def solve(G, e, out):
-    """out = G^-1 e by cofactors (a thrust that lies flat gives what is not finite)."""
+    """out = G^-1 e by cofactors (not finite if the thrust is horizontal)."""
     det = 0.0
     for j in range(3):
         a, b = (j + 1) % 3, (j + 2) % 3

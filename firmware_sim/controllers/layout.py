@@ -1,6 +1,6 @@
 """The controllers' working memory: one flat array, `memory`; each name is an index or the first of several."""
 
-# What the running controller asks for (control_t of the firmware)
+# Output of the running controller (control_t of the firmware)
 MODE = 0  # 0 legacy (PWM units), 1 force and torque (N, N m)
 WRENCH = 1  # thrust N, torque x y z N m
 LEGACY = 5  # thrust, roll, pitch, yaw in PWM units
@@ -10,7 +10,7 @@ REQUEST = 10  # motors 1..4 after battery compensation, before capping
 LEE_I_POS = 16
 LEE_I_ATT = 19
 # LQG
-LQG_ALPHA = 24  # rad/s^2, angular acceleration the rotors should be giving by now
+LQG_ALPHA = 24  # rad/s^2, expected angular acceleration after the rotors' lag
 LQG_GAIN_POS = 28  # K of [p, v]
 LQG_GAIN_ATT = 30  # roll and pitch: K of [angle, rate, angular acceleration]
 LQG_GAIN_YAW = 33
@@ -23,7 +23,7 @@ PID_STATE = 48  # twelve regulators of four
 PID_ATTITUDE = 96  # wanted roll, pitch, yaw, deg
 PID_THRUST = 99
 PID_MODES = 100  # the setpoint's seven modes at the last step
-# INDI: what controllerINDIInit empties comes first
+# INDI: first the part that controllerINDIInit clears
 INDI_FILTERS = 108
 INDI_RATE = 108  # three filters of four: rates
 INDI_PASSED = 120  # commands after the rotors' lag
@@ -39,7 +39,7 @@ INDI_U = 172  # u_in
 INDI_DU = 175
 INDI_ATTITUDE = 178  # wanted roll, pitch, yaw, rad
 INDI_THRUST = 181
-INDI_TILTS = 182  # what the outer loop wants: roll, pitch, rad
+INDI_TILTS = 182  # output of the outer loop: roll, pitch, rad
 INDI_LIFT = 184  # T_incremented
 INDI_LIFT_ACT = 185  # T_inner
 MEMORY_SIZE = 186

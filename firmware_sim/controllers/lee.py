@@ -2,9 +2,9 @@
 
 F_d = a_d + g e3 + Kd e_v + Kp e_p + Ki int e_p;  thrust = mass F_d . R e3
 M = -KR e_R - Kw (w - w_r) - KI int e_R + w x J w, with w_r from the setpoint's jerk and yaw rate.
-It knows places only: with one axis under position control all three are, so a hover setpoint (velocities along x and
-y, which leave the places there 0) pulls towards the origin; without any the thrust is the setpoint's, 0 unless manual.
-One difference: without a place to hold, the attitude setpoint is followed (the firmware keeps an old one).
+It controls positions only. If one axis is under position control, all three are: a hover setpoint has velocities along
+x and y and positions 0 there, so it pulls towards the origin. Without such an axis the thrust is the setpoint's, 0
+unless manual. One difference: without a position, it follows the attitude setpoint (the firmware keeps an old one).
 """
 
 import math
@@ -43,7 +43,7 @@ def reset(memory):
 
 @kernel
 def log_step(estimate, D, memory, log):
-    """Wrench, roll, pitch and yaw as they are and as wanted, into the ctrlLee.* variables."""
+    """Write wrench, actual and desired roll, pitch and yaw into the ctrlLee.* variables."""
     for i in range(4):
         log[lv.LEE_OUT + i] = memory[mem.WRENCH + i]
     roll, pitch, heading = roll_pitch_yaw(estimate, at.E_QUAT)

@@ -2,14 +2,14 @@
 
 t = a_d + g e3 + K_v e_v + K_p e_p;  F = m t . R e3 (eq. 11 and 83 joined: equal when the attitude follows, and without
 the 1/(cos cos) of eq. 83); wanted attitude from t and yaw (flatness);
-M = J u + w x J w (eq. 84), u = K [angle error, rate error, -angular acceleration]. m and J are beliefs (ctrlLqg.*), so
-thrust and torque scale with them; the angular acceleration is that of rotors with lag ctrlLqg.tau.
+M = J u + w x J w (eq. 84), u = K [angle error, rate error, -angular acceleration]. m and J are parameters (ctrlLqg.*):
+thrust and torque scale with them; the angular acceleration is modelled by rotors with lag ctrlLqg.tau.
 
 The gains are those of discrete linear-quadratic regulators from the weights in ctrlLqg.*. Position, one axis:
 x = [p, v], u = acceleration. Attitude, one axis: x = [angle, rate, angular acceleration] with the rotor lag tau between
 the commanded and the actual angular acceleration. Cost: sum of q x^2 and r u^2. The onboard filter supplies the state
 (certainty equivalence; eq. 79-84). Default weights: 1 m/s^2 is worth about 0.14 m; 30 rad/s^2 about 0.1 rad.
-python-control designs the same gains (a test compares), but takes 0.8 s to import at every start.
+python-control gives the same gains (a test compares), but its import takes 0.8 s at every start.
 """
 
 import math
@@ -50,7 +50,7 @@ def design(
     q_yawrate: float,
     r_yaw: float,
 ) -> np.ndarray | None:
-    """[K_p 1/s^2, K_v 1/s, roll and pitch: K 1/s^2, 1/s, -, yaw: K 1/s^2, 1/s, -] (8), or None for senseless weights.
+    """[K_p 1/s^2, K_v 1/s, roll and pitch: K 1/s^2, 1/s, -, yaw: K 1/s^2, 1/s, -] (8), or None for invalid weights.
 
     tau: rotor lag in s; q_*: weights of the state (>= 0, those of position and angles > 0); r_*: of the input (> 0).
     """
@@ -83,7 +83,7 @@ def regulator(A: np.ndarray, b: np.ndarray, q: np.ndarray, r: float) -> np.ndarr
 
 @kernel
 def reset(memory):
-    """Rotors at rest."""
+    """Set the modelled angular acceleration of the rotors to zero."""
     for i in range(3):
         memory[mem.LQG_ALPHA + i] = 0.0
 

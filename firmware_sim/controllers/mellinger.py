@@ -3,7 +3,7 @@
 F_des = mass (a_d + g e3) + kp e_p + kd e_v + ki int e_p;  thrust = massThrust F_des . R e3
 M = -kR vee(D'R - R'D) + kw e_w + ki_m int + kd_omega d(e_w)/dt, pitch inverted for the mixer. The mixer's scale is
 65535 = THRUST_MAX a motor, so ctrlMel.mass is only a mass if massThrust fits the platform.
-It knows places and, without thrust of its own, attitudes; whatever else is asked for (velocities, levelling out after
+It controls positions and, with the setpoint's thrust, attitudes. Any other setpoint (velocities, levelling out after
 a timeout) is a hover at the setpoint's height: level, with the present yaw, without feedforward.
 """
 

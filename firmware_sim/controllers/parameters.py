@@ -1,4 +1,4 @@
-"""The parameters that flight control reads: which they are, their boot values and their array indices.
+"""The parameters of flight control: names, boot values and array indices.
 
 Names and boot values are the firmware's (contents.py). All live in one float64 array that compiled code reads each
 step. `ctrlLqg` is ours: the out-of-tree controller 6.
@@ -6,16 +6,16 @@ step. `ctrlLqg` is ours: the out-of-tree controller 6.
 
 from firmware_sim import contents
 
-# Groups of the firmware's table that are ours whole, in its order.
+# Groups of the firmware's table that are complete here, in its order.
 _WHOLE_GROUPS = (
     *("stabilizer", "powerDist", "motorPowerSet", "kalman", "locSrv"),
     *("ctrlLee", "ctrlMel", "ctrlINDI", "posCtrlIndi"),
 )
-# PID: the gains of the twelve regulators stand together and in this order, then what else these groups hold.
+# PID: first the gains of the twelve regulators in this order, then the other parameters of these groups.
 _PID = ("pid_attitude", "pid_rate", "posCtlPid", "velCtlPid")
 _GAINS = ("kp", "ki", "kd", "kff")
 
-# The out-of-tree controller: what it believes, and the weights of its cost (lqg.py).
+# The out-of-tree controller: its model parameters and the weights of its cost (lqg.py).
 _LQG: dict[str, float] = {
     "ctrlLqg.mass": 0.029,
     "ctrlLqg.J_x": 1.657171e-5,
@@ -53,7 +53,7 @@ PARAMETER_INDEX = {name: i for i, name in enumerate(PARAMETER_NAMES)}
 
 
 def defaults(platform: str) -> dict[str, float]:
-    """Parameter values at boot of a platform ("cf2", "cf21bl"), before a scenario changes what is believed."""
+    """Parameter values at boot of a platform ("cf2", "cf21bl"), before a scenario changes them."""
     values = contents.defaults(_FIRMWARE, platform)
     return values | _LQG | {"ctrlLqg.mass": values["ctrlLee.mass"]}
 

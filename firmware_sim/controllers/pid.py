@@ -1,7 +1,7 @@
-"""Controller 1, the cascaded PID the drone boots with: position and velocity at 100 Hz, attitude and rate at 500 Hz.
+"""Controller 1, the default cascaded PID: position and velocity at 100 Hz, attitude and rate at 500 Hz.
 
 controller_pid.c, position_controller_pid.c, attitude_pid_controller.c and pid.c; degrees, legacy pitch (nose up
-positive), output in PWM units for the legacy mixer. It knows neither mass nor inertia.
+positive), output in PWM units for the legacy mixer. It uses neither mass nor inertia.
 """
 
 import math
@@ -56,14 +56,14 @@ def regulate(k, desired, measured, dt, limit, circular, cutoff, param, memory, l
 
 @kernel
 def reset(estimate, memory):
-    """Forget integrals and hold the present heading."""
+    """Clear integrals and hold the present heading."""
     clear_integrals(estimate, memory)
     memory[mem.PID_ATTITUDE + 2] = angles(estimate)[2]
 
 
 @kernel
 def clear_integrals(estimate, memory):
-    """Forget integrals; derivatives start from what is measured now. The heading to hold stays."""
+    """Clear integrals; derivatives start from the present measurement. The heading to hold stays."""
     roll, pitch, yaw = angles(estimate)
     measured = (roll, pitch, yaw, 0.0, 0.0, 0.0)
     for k in range(12):

@@ -1,6 +1,6 @@
-"""From the controller's wish to motor commands at 1 kHz: mixing, battery compensation, capping and idle thrust.
+"""From the controller's output to motor commands at 1 kHz: mixing, battery compensation, capping and idle thrust.
 
-power_distribution_quadrotor.c and motors.c: integer truncations included, because they are what motor.m* log.
+As power_distribution_quadrotor.c and motors.c, with their integer truncations: motor.m* log the truncated values.
 """
 
 import math
@@ -69,7 +69,7 @@ def compensate(board, volts, request):
 
 @kernel
 def motors_step(board, state, sensor, param, memory, log, allowed, armed):
-    """Set the four PWM ratios from the controller's wish, or from motorPowerSet when that is on."""
+    """Set the four PWM ratios from the controller's output, or from motorPowerSet if enabled."""
     sensor[at.VBAT_FILTERED] += 0.01 * (sensor[at.VBAT] - sensor[at.VBAT_FILTERED])
     highest = 0.0
     for i in range(4):

@@ -1,7 +1,7 @@
 """One millisecond of the whole drone: sense, estimate, control, drive the motors, move the body, publish.
 
-`tick_step` is for a drone without effects: `tick_step_with_effects` has the same order with them, so that neither time
-to run nor time to compile is spent on what is not there.
+`tick_step` is for a drone without effects; `tick_step_with_effects` has the same order. So a drone without effects
+spends no time on running or compiling them.
 """
 
 import math
@@ -45,7 +45,7 @@ PID, MELLINGER, INDI, LEE, LQG = 1.0, 2.0, 3.0, 5.0, 6.0  # stabilizer.controlle
 
 @kernel
 def control_step(setpoint, estimate, sensor, param, memory, log, tick):
-    """Run the selected controller at its rate; a newly selected one starts without integrals."""
+    """Run the selected controller at its rate; a new selection starts with empty integrals."""
     which = param[pm.CONTROLLER]
     if memory[mem.RUNNING] != which:
         memory[mem.RUNNING] = which
@@ -65,7 +65,7 @@ def control_step(setpoint, estimate, sensor, param, memory, log, tick):
             lqg_step(setpoint, estimate, sensor, param, memory, log)
         else:
             lee_step(setpoint, estimate, sensor, param, memory, log)
-    for i in range(mem.MEMORY_SIZE):  # a setpoint or gain that is not a number must not poison the integrals
+    for i in range(mem.MEMORY_SIZE):  # a setpoint or gain that is not a number must not stay in the integrals
         if not math.isfinite(memory[i]):
             memory[i] = 0.0
 

@@ -1,6 +1,6 @@
 """The log variables that flight control and state estimation provide, in one float64 array, in the firmware's units.
 
-Each constant is the index of the first of a run of variables; the order within a run is the order of the names here.
+Each constant is the index of the first variable of a group; the order within a group is that of the names here.
 """
 
 _XYZ = ("x", "y", "z")

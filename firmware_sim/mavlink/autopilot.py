@@ -1,6 +1,6 @@
 """The simulated drone as a PX4 autopilot: MAVLink bytes in, time forward, MAVLink bytes out; no socket, no clock.
 
-Modes as far as they matter: take-off, hold, land (the high-level planner flies) and offboard (the client's setpoints).
+Modes: take-off, hold, land (the high-level planner flies) and offboard (the client's setpoints).
 Sources: mavlink.io/en/services (command, parameter, offboard control), PX4 v1.15 px4_custom_mode.h, Commander.
 """
 
@@ -27,7 +27,7 @@ _FASTEST_US = 1000  # shortest interval of a stream
 _TARGET_MASKS = 0x007, 0x038, 0x1C0  # ignore position, velocity, acceleration
 _OFFBOARD_FRESH = 500  # ms within which a setpoint must have come for offboard
 _MOST_WAITING = 4096  # frames that wait for a slow wire
-# kept up without being asked for: message -> us
+# messages that are streamed without a request: message -> us
 _BY_ITSELF = {0: 1_000_000, 1: 1_000_000, 245: 1_000_000, 147: 2_000_000, 30: 100_000, 32: 100_000}
 # MAV_DATA_STREAM -> messages
 _GROUPS = {1: (105,), 2: (1, 147, 245), 3: (375,), 6: (32, 85), 10: (30, 31), 11: ()}
@@ -37,9 +37,9 @@ class Autopilot:
     """A booted autopilot.
 
     Args:
-        firmware: the drone; nobody else may talk to it.
-        thrust: N, most that its four rotors give together, by what it believes.
-        system: its number.
+        firmware: the drone; the autopilot is its only client.
+        thrust: N, largest total thrust of the four rotors by the firmware's constants.
+        system: the MAVLink system id.
 
     Attributes:
         outbox: frames to be sent.
@@ -77,7 +77,7 @@ class Autopilot:
     # Time.
 
     def next_event(self) -> int:
-        """The tick [ms] before which nothing leaves by itself."""
+        """The tick [ms] before which the autopilot sends nothing of its own accord."""
         tick = self.firmware.flight.tick
         if self._list:
             return tick + 1
@@ -89,12 +89,12 @@ class Autopilot:
         end = flight.tick + milliseconds
         while flight.tick < end:
             self.firmware.advance(min(end, self.next_event()) - flight.tick)
-            self.firmware.outbox.clear()  # nobody listens to CRTP
+            self.firmware.outbox.clear()  # there is no CRTP client
             self._watch()
             self._stream(flight.tick)
 
     def _watch(self) -> None:
-        """Modes that end by themselves."""
+        """End modes whose end has come: a finished take-off, offboard without setpoints."""
         firmware, tick = self.firmware, self.firmware.flight.tick
         self.telemetry.setpoint = firmware.flight.setpoint
         finished = firmware.high_level.planner.finished(tick / 1000.0)
@@ -141,7 +141,7 @@ class Autopilot:
     # Messages in.
 
     def receive(self, data: bytes, *, channel: int = 0) -> None:
-        """Bytes from a client, whatever they are; each channel is a stream of its own."""
+        """Take any bytes from a client; each channel is a separate stream."""
         if channel not in self._parsers:
             self._parsers[channel] = mavlink.MAVLink(None)
             self._parsers[channel].robust_parsing = True
@@ -205,7 +205,7 @@ class Autopilot:
         self._send(mavlink.MAVLink_command_ack_message(number, result))
 
     def _on_set_position_target_local_ned(self, message: Any) -> None:
-        """A setpoint; it acts in offboard only, but must come before the mode can be entered."""
+        """A setpoint; it acts in offboard mode only, but is needed to enter this mode."""
         setpoint = self._setpoint_of(message)
         if setpoint is None or not np.isfinite(setpoint).all():
             return

@@ -1,8 +1,8 @@
-"""The parameters of the PX4 personality. Two act: MPC_THR_HOVER in the thrust feed-forward, and what streams read.
+"""The parameters of the simulated PX4. MPC_THR_HOVER acts on the thrust feed-forward; streams read some others.
 
-PX4 multiplies the acceleration it wants, in units of gravity, by MPC_THR_HOVER and sends that to the mixer. Here the
-same multiplication is done by the Lee controller, whose believed mass takes the place: mass = hover thrust times the
-largest thrust of the four rotors over gravity. Integers travel as bits, as in PX4.
+PX4 multiplies the desired acceleration, in units of gravity, by MPC_THR_HOVER and sends the product to the mixer. Here
+the Lee controller multiplies by its mass parameter instead: mass = hover thrust times the largest total thrust of the
+four rotors over gravity. Integers are sent as bits, as in PX4.
 """
 
 import math
@@ -18,7 +18,7 @@ LEAST, MOST = 0.1, 0.8  # of MPC_THR_HOVER, as PX4 has them
 
 @dataclass(slots=True)
 class Parameter:
-    """A value and how it travels; `least`, `most`: what it is held within."""
+    """A value and its type on the wire; `least`, `most`: its limits."""
 
     name: str
     kind: int
@@ -33,7 +33,7 @@ class Parameter:
         return float(struct.unpack("<f", struct.pack("<i", int(self.value)))[0])
 
     def take(self, wire: float, kind: int) -> bool:
-        """From a PARAM_SET; False: not the right type, or no number."""
+        """Set the value from a PARAM_SET, within the limits; False: wrong type, or not a number."""
         if kind != self.kind:
             return False
         value = wire if kind == REAL32 else float(struct.unpack("<i", struct.pack("<f", wire))[0])
@@ -47,8 +47,8 @@ class Parameters:
     """The table, in alphabetical order, as PX4 sends it.
 
     Args:
-        mass: kg the firmware believes. thrust: N, most that the four rotors give together by what it believes.
-        believe: told the mass [kg] that follows from a new hover thrust.
+        mass: kg, of the firmware's controller. thrust: N, largest total thrust of the four rotors by its constants.
+        believe: called with the mass [kg] of a new hover thrust.
     """
 
     def __init__(self, *, mass: float, thrust: float, believe: Callable[[float], None]) -> None:
@@ -75,10 +75,10 @@ class Parameters:
         self.by_name = {p.name: p for p in self.items}
 
     def set(self, name: str, wire: float, kind: int) -> Parameter | None:
-        """The parameter as it is now, None if there is no such."""
+        """Set a parameter and return it; None if the name is unknown."""
         parameter = self.by_name.get(name)
         if parameter is not None and parameter.take(wire, kind) and name == HOVER:
-            value = parameter.wire()  # what was echoed is what acts
+            value = parameter.wire()  # the value in effect is the one that was echoed
             parameter.value = value
             self._believe(value * self._thrust / GRAVITY)
         return parameter

@@ -1,4 +1,4 @@
-"""The MAVLink front end: its wires (UDP or a pseudo-terminal), the loop in real time, and how a run begins."""
+"""The MAVLink front end: its wires (UDP or a pseudo-terminal), the loop in real time, and the start of a run."""
 
 import argparse
 import contextlib
@@ -22,7 +22,7 @@ _BURST, _ERRORS = 64, 16  # datagrams handled at a time; errors of a client that
 class Wire(Protocol):
     """Bytes both ways, never blocking."""
 
-    where: str  # as a client writes it
+    where: str  # address as a client writes it
 
     def fileno(self) -> int: ...
     def receive(self) -> bytes: ...
@@ -66,13 +66,13 @@ class Udp:
 
     def send(self, data: bytes) -> bool:
         if self._peer is None:
-            return True  # nobody to hear it
+            return True  # there is no client yet
         try:
             self._socket.sendto(data, self._peer)
         except BlockingIOError:
             return False
         except OSError:
-            return True  # as good as lost in the air
+            return True  # the packet is lost
         return True
 
     def close(self) -> None:
@@ -101,7 +101,7 @@ class Pty:
             return b""
 
     def send(self, data: bytes) -> bool:
-        """Whole frames or nothing, as far as the system allows; False: nobody reads."""
+        """Send a whole frame or nothing, as far as the system allows; False: nobody reads."""
         try:
             return os.write(self._master, data) == len(data)
         except BlockingIOError:
@@ -127,7 +127,7 @@ def wire_of(text: str) -> Wire:
 
 
 class MavlinkServer:
-    """Runs an autopilot at some wires: all hear the same, all may command. speed: its seconds per host second."""
+    """Runs an autopilot on several wires: all get the same, all may command. speed: its seconds per host second."""
 
     def __init__(
         self, autopilot: Autopilot, wires: Sequence[Wire], *, speed: float = 1.0, truth: TextIO | None = None
@@ -138,7 +138,7 @@ class MavlinkServer:
         self.stopping = False
 
     def run(self) -> None:
-        """Serve until `stopping` is set (a signal handler does)."""
+        """Serve until a signal handler sets `stopping`."""
         flight = self.autopilot.firmware.flight
         zero, epoch = flight.tick, time.monotonic()
         while not self.stopping:
@@ -156,13 +156,13 @@ class MavlinkServer:
 
     def _listen(self) -> None:
         for number, wire in enumerate(self._wires):
-            for _ in range(_BURST):  # the flight goes on whatever comes in
+            for _ in range(_BURST):  # a limit, so that the flight goes on
                 if not (data := wire.receive()):
                     break
                 self.autopilot.receive(data, channel=number)
 
     def _talk(self) -> None:
-        """A wire that has no room loses the frame, as a radio does."""
+        """Send waiting frames; a wire without room loses the frame, like a radio."""
         while self.autopilot.outbox:
             frame = self.autopilot.outbox.popleft()
             self.dropped += sum(not wire.send(frame) for wire in self._wires)

@@ -1,7 +1,7 @@
 """Messages that the simulated autopilot streams, made from the firmware's log variables, in MAVLink's frames.
 
-MAVLink's are FRD and north-east-down; our x axis is north. Half a turn about x leads from one to the other and back:
-y and z change their signs.
+MAVLink uses FRD and north-east-down; our x axis is north. Half a turn about x converts either way: y and z change
+their signs.
 """
 
 import math
@@ -18,7 +18,7 @@ ROTOR = (0, 2, 3, 1)
 
 
 def turned(v: Sequence[float]) -> tuple[float, float, float]:
-    """A vector, either way."""
+    """A vector, converted either way."""
     return v[0], -v[1], -v[2]
 
 
@@ -44,7 +44,7 @@ def px4_order(values: Sequence[float]) -> tuple[float, ...]:
 
 GRAVITY = 9.81
 UNKNOWN = 65535
-UID = b"crazyem firmware"  # how a client can know that nothing real is at the other end
+UID = b"crazyem firmware"  # tells a client that the drone is simulated
 
 
 class EscStatus(mavlink.MAVLink_message):
@@ -66,7 +66,7 @@ class EscStatus(mavlink.MAVLink_message):
 
 
 class Telemetry:
-    """Makes messages. log: the firmware's variables. state: landed state and modes, told by the autopilot."""
+    """Makes messages. log: the firmware's variables. state: landed state and modes, set by the autopilot."""
 
     def __init__(self, log: Mapping[str, Slot], *, tick: Callable[[], int], beat: Callable[[], Any]) -> None:
         self._log, self._tick, self._beat = log, tick, beat
@@ -152,7 +152,7 @@ class Telemetry:
         )
 
     def _target(self) -> Any:
-        """PX4 streams the setpoint in force only while it flies by position."""
+        """The present setpoint, which PX4 streams only under position control."""
         s = self.setpoint
         if s is None or s[sp.MODE_X] != sp.ABSOLUTE or s[sp.MODE_Z] != sp.ABSOLUTE:
             return None

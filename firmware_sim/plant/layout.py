@@ -1,8 +1,8 @@
-"""Where everything lives in the flat arrays that the compiled plant works on. World frame z up, body x forward, y left.
+"""Indices into the flat arrays of the compiled plant. World frame z up, body x forward, y left.
 
-Each name is an index (or the first of several). Arrays: `state` (what is true now), `truth` (the constants of the
-scenario, never visible to the firmware's tables), `board` (constants compiled into the firmware), `sensor` (memories of
-the sensors), `estimate` (the onboard estimate).
+Each name is an index (or the first of several). Arrays: `state` (true state), `truth` (constants of the scenario, not
+in the firmware's tables), `board` (constants compiled into the firmware), `sensor` (memories of the sensors),
+`estimate` (the onboard estimate).
 """
 
 # state
@@ -17,14 +17,14 @@ VOLTS = 21  # V at the battery's terminals
 FEET = 22  # how many of the four feet touch the floor
 ASLEEP = 23  # 1 while resting on the floor
 PWM = 24  # 0..65535, ratio at motors 1..4
-CLOCK = 28  # ms since boot; this and what follows only with effects
+CLOCK = 28  # ms since boot; this and the following only with effects
 AIRBORNE = 29  # ms since the feet first left the floor
-GUST = 30  # m/s, world, what the gusts add to the wind
+GUST = 30  # m/s, world, velocity of the gusts beside the wind
 SPIN = 33  # N m s, angular momentum of the rotors about body z over the last step
 LOAD = 34  # unit vector from the hook to the suspended load, world
 LOAD_RATE = 37  # 1/s, its rate of change
 PHASE = 40  # rad, of the hidden vibration
-HELD = 41  # 0..65535, what the hidden sticky rotor follows
+HELD = 41  # 0..65535, command that the hidden sticky rotor follows
 COMMANDS = 42  # DELAY_ROWS x 4, past PWM, a ring indexed by CLOCK
 DELAY_ROWS = 128  # more than the longest delay in ms
 STATE_SIZE = COMMANDS + 4 * DELAY_ROWS
@@ -60,10 +60,10 @@ FIX_PERIOD = 51  # ms
 FIX_POSITION = 52  # m, sd
 FIX_ATTITUDE = 53  # rad, sd
 ARM_Y = 54  # m
-STANDING_MASS = 55  # kg, what the floor carries: the body and its suspended load
-# constants of the effects (effects/*.py say what they do)
+STANDING_MASS = 55  # kg, load of the floor: the body and its suspended load
+# constants of the effects (described in effects/*.py)
 COM = 56  # m, body, centre of mass from the geometric origin
-EFFECT_ROTORS = 59  # 1: something of effects/drive.py is not neutral
+EFFECT_ROTORS = 59  # 1: an effect of effects/drive.py is not neutral
 EFFECT_BODY = 60  # the same for effects/motion.py
 EFFECT_SENSING = 61  # the same for effects/sensing.py
 INPUT_DELAY = 62  # ms
@@ -87,7 +87,7 @@ RATE_DAMPING = 83  # N m s
 WIND = 86  # m/s, world
 GUST_SD = 89  # m/s
 GUST_TIME = 90  # s
-WIND_DRAG = 91  # N s/m, what turns wind into force where no drag is set
+WIND_DRAG = 91  # N s/m, force per wind where no drag is set
 LOAD_MASS = 92  # kg
 LOAD_LENGTH = 93  # m
 LOAD_FRICTION = 94  # 1/s
@@ -113,11 +113,11 @@ CABLE_POINT = 128  # m, world
 FEET_REACH = 131  # m, no foot touches while the origin is higher than that
 TRIM = 132  # m, steady torque of the rotors over their thrust, body x y z (an effect of the catalogue)
 RPM_INVALID = 135  # a standard normal number above it makes a report of rotor speed unreadable
-INTEGRATION_STEP = 136  # ms, whole: the plant moves once in so many ticks
+INTEGRATION_STEP = 136  # ms, whole: time between two steps of the plant
 GYRO_STEP = 137  # rad/s, of the sensor's counts
 ACC_STEP = 138  # m/s^2
 PREDICT_PERIOD = 139  # ms between predictions of the onboard estimate
-PREDICT_SLIP = 140  # a standard normal number above it makes a prediction 1 ms late, and with it all that follow
+PREDICT_SLIP = 140  # a standard normal number above it makes this and all later predictions 1 ms later
 FIX_PHASE = 141  # ms after a multiple of FIX_PERIOD at which built-in fixes come
 TRUTH_SIZE = 142
 
@@ -143,7 +143,7 @@ PAST_POSE = 24  # DELAY_ROWS x 7: position, quaternion; rings for measurement_de
 PAST_GYRO = PAST_POSE + 7 * DELAY_ROWS  # DELAY_ROWS x 3
 PAST_ACC = PAST_GYRO + 3 * DELAY_ROWS  # DELAY_ROWS x 3
 PAST_STATE = PAST_ACC + 3 * DELAY_ROWS  # DELAY_ROWS x 16: position, velocity, quaternion, gyro, accelerometer
-KEPT = PAST_STATE + 16 * DELAY_ROWS  # estimate, gyro and accelerometer while others stand in for them
+KEPT = PAST_STATE + 16 * DELAY_ROWS  # estimate, gyro and accelerometer, saved while delayed or scaled ones replace them
 SENSOR_SIZE = KEPT + 16
 
 # estimate
@@ -174,4 +174,4 @@ N_GUST = 20
 N_SLIP = 26
 N_RPM = 27
 N_BARO = 31
-NOISE_WIDTH = 32  # the rest is kept for effects, so that adding one does not change the others' noise
+NOISE_WIDTH = 32  # with reserve, so that a new effect does not change the noise of the others

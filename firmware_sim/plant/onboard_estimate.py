@@ -1,10 +1,10 @@
 """The onboard state estimate: an error-state Kalman filter on position, velocity and attitude, tuned by `kalman.*`.
 
-Fed as the firmware's own filter is: gyro and accelerometer at 1 kHz (filtered, so late by a few ms), averaged between
-predictions; state and covariance are predicted 100 times a second only (PREDICT_RATE of estimator_kalman.c) with the
-process noise of kalman_core.c; position fixes (and attitude fixes) weighted by locSrv.extPosStdDev and
-locSrv.extQuatStdDev. Between predictions the state stands still, so what controllers and log get is up to 10 ms old:
-its error grows with speed, and is correlated in time, as on a real drone.
+Inputs as of the firmware's filter: gyro and accelerometer at 1 kHz (filtered, so late by a few ms), averaged between
+predictions; position fixes (and attitude fixes) weighted by locSrv.extPosStdDev and locSrv.extQuatStdDev. State and
+covariance are predicted 100 times a second (PREDICT_RATE of estimator_kalman.c) with the process noise of
+kalman_core.c. Between predictions the state is constant, so controllers and log get a state up to 10 ms old: its error
+grows with speed and is correlated in time, as on a real drone.
 Error state: position (world, m), velocity (world, m/s), attitude (body, rad).
 """
 
@@ -23,7 +23,7 @@ from firmware_sim.plant.rigid_body import GRAVITY
 
 @kernel
 def estimate_step(truth, state, sensor, estimate, P, param, noise, tick, flying):
-    """One millisecond: add up the sensors, predict when it is time, and take the fixes that are due."""
+    """One millisecond: add up the sensors, predict when due, and use the fixes that are due."""
     if estimate[at.E_RESET] > 0.0 or not healthy(estimate, P):
         estimate[at.E_RESET] = 0.0
         reset_filter(truth, state, estimate, P)
@@ -31,7 +31,7 @@ def estimate_step(truth, state, sensor, estimate, P, param, noise, tick, flying)
     if tick >= estimate[at.E_DUE]:
         estimate[at.E_DUE] = tick + truth[at.PREDICT_PERIOD]
         if noise[at.N_SLIP] > truth[at.PREDICT_SLIP]:
-            estimate[at.E_DUE] += 1.0  # as the firmware counts: from when it came to the next
+            estimate[at.E_DUE] += 1.0  # as the firmware: counted from this prediction, so a delay stays
         dt = 1e-3 * estimate[at.E_COUNT]
         integrate(estimate, dt, flying)
         if flying:
@@ -62,7 +62,7 @@ def estimate_step(truth, state, sensor, estimate, P, param, noise, tick, flying)
 
 @kernel
 def healthy(estimate, P):
-    """False once a parameter that is not a number has got into the filter: it then starts again."""
+    """False if the filter holds a value that is not a number, from a parameter; the filter then restarts."""
     total = 0.0
     for i in range(9):
         total += P[i, i]
@@ -75,7 +75,7 @@ def healthy(estimate, P):
 
 @kernel
 def reset_filter(truth, state, estimate, P):
-    """Start at the true position and attitude (the drone is placed and levelled by hand) with a small covariance."""
+    """Start at the true position and attitude (the user places the drone level) with a small covariance."""
     if truth[at.EFFECT_SENSING] > 0.0:
         origin(truth, state, estimate[at.E_POS : at.E_POS + 3], estimate[at.E_VEL : at.E_VEL + 3])
     else:
@@ -104,9 +104,9 @@ def accumulate(sensor, estimate):
 
 @kernel
 def integrate(estimate, dt, flying):
-    """Strapdown integration over dt of the filtered gyro and accelerometer, by their mean since the last time.
+    """Strapdown integration over dt of the filtered gyro and accelerometer, by their mean since the last prediction.
 
-    In the air only the accelerometer's z counts (kalman_core.c, predictDt): a drag along x and y is not seen then.
+    In the air it uses only the accelerometer's z (kalman_core.c, predictDt), so it does not see a drag along x and y.
     """
     R = np.empty((3, 3))
     matrix(estimate, at.E_QUAT, R)
@@ -131,10 +131,10 @@ def integrate(estimate, dt, flying):
 
 @kernel
 def drag(estimate, param, dt):
-    """The drag that kalman.dragB_* tells the filter of: acceleration -dragB v of the centre of pressure, body axes.
+    """The filter's model of drag, kalman.dragB_*: acceleration -dragB v of the centre of pressure, body axes.
 
     dragB [1/s] is drag over mass (the firmware's own text says N s/m); the centre of pressure lies at kalman.cop_* [m].
-    The firmware leaves it out while it does not fly.
+    The firmware uses it in flight only.
     """
     if param[pm.DRAG] == 0.0 and param[pm.DRAG + 1] == 0.0 and param[pm.DRAG + 2] == 0.0:
         return
@@ -223,7 +223,7 @@ def scalar_update(estimate, P, index, innovation, variance):
 
 @kernel
 def attitude_update(estimate, P, q, o, sd):
-    """Take an attitude q[o:o+4] (w first) as three measurements of the attitude error."""
+    """Update with an attitude q[o:o+4] (w first) as three measurements of the attitude error."""
     for i in range(3):
         a = at.E_QUAT
         w, x, y, z = estimate[a], estimate[a + 1], estimate[a + 2], estimate[a + 3]

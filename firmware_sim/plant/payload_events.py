@@ -1,7 +1,7 @@
 """Payloads attached and released in flight: mass, centre of mass and inertia step, momentum is conserved.
 
-A released payload leaves with the velocity of its place, so the drone's own motion goes on without a kick. One that is
-attached joins plastically: linear and angular momentum are those of both before.
+A released payload has the velocity of its place on the drone, so the drone's velocity does not jump. An attached one
+joins in a plastic impact: linear and angular momentum are the sums of both.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ _BODY = [
     *range(at.CONTACT_FREQUENCY, at.CONTACT_STICK + 1),
     at.STANDING_MASS,
     *range(at.COM, at.COM + 3),
-]  # what a payload changes among the plant's constants
+]  # constants of the plant that a payload changes
 _KEYS = {
     "attach": ("action", "time", "after", "mass", "position", "velocity"),
     "release": ("action", "time", "after"),
@@ -29,10 +29,10 @@ _KEYS = {
 
 @dataclass(frozen=True)
 class PayloadEvent:
-    """One payload comes or goes.
+    """One payload is attached or released.
 
     Attributes:
-        action: attach, or release (of the newest that is carried).
+        action: attach, or release (of the payload attached last).
         time: s after `after`: "start" (boot) or "take-off" (when the feet first left the floor).
         mass: kg. position: m, body axes, from the geometric origin.
         velocity: m/s, world, of the payload before it is attached; None: it moves with the drone.
@@ -50,7 +50,7 @@ PointMass = tuple[float, tuple[float, ...]]  # kg; m, body
 
 
 def carried(first: Sequence[PointMass], events: Sequence[PayloadEvent]) -> list[PointMass]:
-    """Point masses carried after `events`, `first` before them. IndexError if one is released that is not there."""
+    """Point masses carried after `events`, `first` before them. Raises IndexError for a release without a payload."""
     load = list(first)
     for event in events:
         if event.action == "attach":
@@ -79,7 +79,7 @@ class PayloadChanges:
         return passed >= 1000.0 * event.time
 
     def apply(self, truth: np.ndarray, state: np.ndarray) -> None:
-        """Let the next event happen; changes both arrays in place."""
+        """Apply the next event; changes both arrays in place."""
         event, after = self._waiting.pop(0)
         change_body(truth, state, after, event)
 

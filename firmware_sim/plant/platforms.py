@@ -1,4 +1,4 @@
-"""Constants of the two platforms: what the firmware has compiled in, and the plant's defaults that go with it.
+"""Constants of the two platforms: those compiled into the firmware, and the plant's defaults.
 
 platform_defaults_cf2.h and platform_defaults_cf21bl.h (2.1+ propellers on cf2). Inertia: Foerster, System
 Identification of the Crazyflie 2.0, ETH Zurich 2015 (cf2); Busetto et al., arXiv 2512.14450, from CAD (cf21bl).
@@ -21,7 +21,7 @@ class Platform:
     thrust_max: float
     torque_per_thrust: float
     brushless: bool
-    rotor_thrust_limit: float  # N, where the plant's rotor saturates, beyond the firmware's full scale
+    rotor_thrust_limit: float  # N, limit of the plant's rotor, above the firmware's full scale
     capacity: float  # A h
     power_coefficient: float  # W/N^1.5 per rotor
     rotor_constant: float  # N/(rad/s)^2

@@ -2,7 +2,7 @@
 
 dp = v dt;  m dv = (R e3 F + f_ext - m g e3) dt + R e3 s_F dW_0;  dq = q w/2 dt;
 J dw = (M + m_ext - w x J w) dt + s_M dW   (Zhao, eq. 54-55 with the full inertia matrix and R e3 = third column of R).
-A body with effects takes effects/step.py's way; the equations are written out in both, because a call costs time here.
+effects/step.py is for a body with effects; the equations are written out in both, because a call costs time here.
 
 The drone stands on four feet under the rotors, each a spring and damper with Coulomb friction. The spring is soft
 enough for a 1 ms step (see scenario.py) and its rest position is shifted so that the drone stands at exactly the
@@ -148,7 +148,7 @@ def body_step(truth, state, u, force, torque, noise, dt):
         V = at.INERTIA_INV
         for i in range(3):
             x[10 + i] += truth[V + 3 * i] * w[0] + truth[V + 3 * i + 1] * w[1] + truth[V + 3 * i + 2] * w[2]
-    for i in range(3):  # far beyond what such a drone survives; keeps absurd scenarios finite
+    for i in range(3):  # far above realistic speeds; keeps extreme scenarios finite
         x[3 + i] = min(max(x[3 + i], -SPEED_LIMIT), SPEED_LIMIT)
         x[10 + i] = min(max(x[10 + i], -RATE_LIMIT), RATE_LIMIT)
         w[i] = (x[3 + i] - before[i]) / dt
@@ -159,7 +159,7 @@ def body_step(truth, state, u, force, torque, noise, dt):
 
 @kernel
 def is_resting(truth, state, u, force, torque):
-    """True if the drone stands still on all four feet and nothing acts that could move it: it is then left alone."""
+    """True if the drone stands still on all four feet and no force could move it: it is then not integrated."""
     if state[at.FEET] < 4:
         return False
     weight = truth[at.STANDING_MASS] * GRAVITY

@@ -1,4 +1,4 @@
-"""Rotors and the cell that drives them: command and voltage to thrust, lag, four rotors to force and torque.
+"""Rotors and battery cell: command and voltage to thrust, lag, four rotors to force and torque.
 
 Motors: M1 front right, M2 back right, M3 back left, M4 front left (x forward, y left, z up).
 

@@ -1,7 +1,7 @@
-"""Inertial sensors as the firmware hands them on: noise, counts, slow gyro bias, second-order Butterworth filters.
+"""Inertial sensors as the firmware reads them: noise, counts, slow gyro bias, second-order Butterworth filters.
 
-Gyro 80 Hz, accelerometer 30 Hz, both at 1 kHz (sensors_bmi088_bmp3xx.c, filter.c). The noise is standard normal numbers
-by seed and firmware tick: the same seed gives the same noise, whatever is flown.
+Gyro 80 Hz, accelerometer 30 Hz, both at 1 kHz (sensors_bmi088_bmp3xx.c, filter.c). Noise is made of standard normal
+numbers by seed and firmware tick: the same seed gives the same noise on any flight.
 """
 
 import math
@@ -33,7 +33,7 @@ class NoiseSource:
         return row
 
     def boot(self, size: int) -> np.ndarray:
-        """`size` numbers for what is random once per flight; independent of the rows."""
+        """`size` numbers for quantities that are random once per flight; independent of the rows."""
         return np.random.default_rng([self._seed, 0, 1]).standard_normal(size)
 
 
@@ -59,7 +59,7 @@ def low_pass(memory, o, value, cutoff):
 
 @kernel
 def settle(memory, o, value, cutoff):
-    """Set the filter's memories to where a constant `value` would have brought them."""
+    """Set the filter's memories to their steady state for a constant `value`."""
     c = math.tan(math.pi * cutoff / RATE)
     b = c * c / (1.0 + math.sqrt(2.0) * c + c * c)
     memory[o] = value / (4.0 * b)
@@ -68,7 +68,7 @@ def settle(memory, o, value, cutoff):
 
 @kernel
 def quantised(value, step):
-    """`value` in whole steps of the sensor; as it is where the step is 0."""
+    """`value` in whole steps of the sensor; unchanged if the step is 0."""
     return step * math.floor(value / step + 0.5) if step > 0.0 else value
 
 

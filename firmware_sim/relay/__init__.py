@@ -1,1 +1,1 @@
-"""A UDP relay that harms the packets between a host and a Crazyflie on purpose: `python -m firmware_sim.relay`."""
+"""A UDP relay that puts faults on the packets between a host and a Crazyflie: `python -m firmware_sim.relay`."""

@@ -128,7 +128,7 @@ def _text(engine: Engine) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Relay until SIGINT or SIGTERM; 0 then, 2 after a mistake of the user, told in one sentence."""
+    """Relay until SIGINT or SIGTERM. Returns 0 then, 2 after an error of the user (one sentence)."""
     arguments = parser().parse_args(argv)
     try:
         faults, seed = faults_of(arguments)
@@ -149,7 +149,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     end = float("inf") if arguments.duration is None else time.monotonic() + arguments.duration
     try:
         relay.run(lambda: time.monotonic() >= end)
-    except RelayError as error:  # the port was taken while the drone was dead
+    except RelayError as error:  # another program took the port while it was closed
         print(f"relay: {error}", file=sys.stderr)
         return 2
     print(json.dumps(account(engine), indent=2) if arguments.json else _text(engine), flush=True)

@@ -1,4 +1,4 @@
-"""Faults of a link and the engine that applies them: pure, told the time, seeded; no socket in here."""
+"""Faults of a link and the engine that applies them: seeded, without clock and sockets."""
 
 import heapq
 import random
@@ -12,28 +12,28 @@ from firmware_sim.wire import Air
 UP, DOWN = "up", "down"  # from the host to the drone, from the drone to the host
 WHATS = ("drop", "duplicate", "reorder", "delay", "corrupt", "silence", "die")
 FATES = ("received", "forwarded", "dropped", "silenced", "duplicated", "reordered", "delayed", "corrupted", "overflow")
-HOLD_SECONDS = 0.1  # s after which a packet held back for others goes out alone
+HOLD_SECONDS = 0.1  # s after which a packet held back for reordering is sent anyway
 MOST_PENDING = 20_000  # packets on their way; more are lost, as in any queue
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that goes wrong.
+    """One fault.
 
     Attributes:
-        what: drop, duplicate, reorder, delay, corrupt, silence (as drop, all of them), or die (the relay's port is
-            closed, so that the host is told "connection refused").
+        what: drop, duplicate, reorder, delay, corrupt, silence (drops all), or die (closes the relay's port: the host
+            gets "connection refused").
         rate: share of the packets concerned, 0..1.
         direction: "up", "down" or "both".
         kinds: which packets (`kinds.py`); empty means all.
         start, end: s since the host's first packet.
-        skip: how many packets concerned pass first.
-        count: how many are harmed at most, 0 = no limit.
+        skip: number of concerned packets that pass first.
+        count: largest number of harmed packets, 0 = no limit.
         burst: of drop: mean number lost in a row (Gilbert's model).
         ms, jitter_ms: of delay: constant part, and the largest uniform random part. Order is kept.
-        distance: of reorder: how many later packets overtake.
-        bits: of corrupt: how many bits flip, anywhere in the packet.
-        copies: of duplicate: how many more arrive.
+        distance: of reorder: number of later packets that overtake.
+        bits: of corrupt: number of flipped bits, anywhere in the packet.
+        copies: of duplicate: number of additional packets.
     """
 
     what: str
@@ -52,7 +52,7 @@ class Fault:
     copies: int = 1
 
     def __post_init__(self) -> None:
-        """Raises: RelayError naming what does not fit."""
+        """Raises: RelayError naming the invalid field."""
         if self.what not in WHATS:
             raise RelayError(f'there is no fault "{self.what}"; choose {", ".join(WHATS)}')
         if self.direction not in (UP, DOWN, "both"):
@@ -70,7 +70,7 @@ class Fault:
             raise RelayError(f"{self.what}: only drop comes in bursts")
 
     def concerns(self, direction: str, kind: str, elapsed: float) -> bool:
-        """Whether a packet of this kind, that way, `elapsed` s after the first, is one this fault may harm."""
+        """Whether this fault may harm a packet of this kind and direction, `elapsed` s after the first packet."""
         return (
             self.start <= elapsed < self.end
             and self.direction in (direction, "both")
@@ -80,7 +80,7 @@ class Fault:
 
 
 class _Rule:
-    """A fault with its own random numbers, so that another fault beside it changes nothing about this one."""
+    """A fault with its own random numbers, so that it does not depend on other faults."""
 
     def __init__(self, fault: Fault, seed: int, index: int) -> None:
         self.fault = fault
@@ -92,7 +92,7 @@ class _Rule:
         self._air = Air(fault.rate, fault.burst, self.random.randrange(1 << 30)) if losing else None
 
     def strikes(self) -> bool:
-        """Decide about one packet concerned."""
+        """Whether the fault harms the next concerned packet."""
         self.seen += 1
         chosen = self._air.loses() if self._air else self.random.random() < self.fault.rate
         if not chosen or self.seen <= self.fault.skip or (self.fault.count and self.harmed >= self.fault.count):
@@ -114,16 +114,16 @@ class _Held:
 
 @dataclass
 class Counts:
-    """What became of the packets: direction -> fate -> number, and direction -> kind -> number harmed."""
+    """Counts of packets: direction -> fate -> number, and direction -> kind -> number harmed."""
 
     fates: dict[str, Counter[str]] = field(default_factory=lambda: {UP: Counter(), DOWN: Counter()})
     harmed: dict[str, Counter[str]] = field(default_factory=lambda: {UP: Counter(), DOWN: Counter()})
 
 
 class Engine:
-    """Applies faults to packets; what is to be sent comes out of `due`.
+    """Applies faults to packets; `due` gives the packets to send.
 
-    A route is whatever the caller tells apart (a host's connection); packets never change their route.
+    A route is a host's connection, named by the caller; packets stay on their route.
     """
 
     def __init__(self, faults: Sequence[Fault] = (), seed: int = 0) -> None:
@@ -136,12 +136,12 @@ class Engine:
         self.replace(faults)
 
     def replace(self, faults: Sequence[Fault]) -> None:
-        """Other faults from now on, each beginning afresh; packets on their way stay there."""
+        """Set other faults, each from its start; packets under way stay."""
         self._rules = [_Rule(fault, self.seed, i) for i, fault in enumerate(faults)]
 
     @property
     def strikes(self) -> list[tuple[Fault, int]]:
-        """Every fault and how many packets it has harmed."""
+        """Every fault and the number of packets it has harmed."""
         return [(rule.fault, rule.harmed) for rule in self._rules]
 
     def elapsed(self, now: float) -> float:
@@ -156,7 +156,7 @@ class Engine:
         return any(r.fault.what == "die" and r.fault.start <= t < r.fault.end for r in self._rules)
 
     def take(self, now: float, route: Hashable, direction: str, datagram: bytes) -> None:
-        """A packet arrived at `now` [s]; decide what becomes of it."""
+        """Take a packet that arrived at `now` [s] and decide its fate."""
         if self.began is None:
             self.began = now
         kind, fates = kind_of(datagram), self.counts.fates[direction]
@@ -190,7 +190,7 @@ class Engine:
             self._push(release, route, direction, datagram)
 
     def forget(self, route: Hashable) -> None:
-        """A route that is no more; its packets on their way stay the caller's to drop."""
+        """Remove a route; the caller drops its packets under way."""
         for rule in self._rules:
             for direction in (UP, DOWN):
                 rule.newest.pop((route, direction), None)
@@ -217,7 +217,7 @@ class Engine:
         return out
 
     def _overtaken(self, route: Hashable, direction: str) -> list[tuple[Hashable, str, bytes]]:
-        """One more packet of this route has gone out: who has waited long enough."""
+        """Held packets to release now that one more packet of this route has gone out."""
         for h in self._held:
             if h.route == route and h.direction == direction:
                 h.left -= 1

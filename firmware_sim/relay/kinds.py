@@ -54,7 +54,7 @@ def kind_of(datagram: bytes) -> str:
 def check_kinds(names: Iterable[str]) -> frozenset[str]:
     """The names as a set; a name is a kind, or the part before its dot for all of a port.
 
-    Raises: RelayError naming what is unknown.
+    Raises: RelayError naming the unknown kind.
     """
     known = set(KIND_NAMES.values()) | _GROUPS | {OTHER}
     wanted = frozenset(names)

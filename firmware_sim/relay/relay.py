@@ -10,7 +10,7 @@ from firmware_sim.relay.faults import DOWN, UP, Engine
 from firmware_sim.relay.kinds import RelayError
 
 Address = tuple[str, int]
-MOST_HOSTS = 64  # the one that was silent longest goes first: every scan is a host of its own
+MOST_HOSTS = 64  # beyond, the longest silent host is removed: every scan counts as a new host
 _BUFFER = 1 << 20  # bytes
 _LONGEST_NAP = 0.05  # s between two looks at the schedule
 
@@ -31,7 +31,7 @@ class Relay:
 
     Args:
         target: address of the drone.
-        engine: what goes wrong.
+        engine: applies the faults.
         host, port: where to listen; port 0 picks a free one.
 
     Raises: RelayError: the port cannot be listened on.
@@ -59,7 +59,7 @@ class Relay:
         return f"udp://{self._address[0]}:{self._address[1]}"
 
     def run(self, until: Callable[[], bool] | None = None) -> None:
-        """Relay until `stopping` is set or `until()` says so; closes everything."""
+        """Relay until `stopping` is set or `until()` is true; closes everything."""
         try:
             while not self.stopping and not (until is not None and until()):
                 now = time.monotonic()
@@ -105,9 +105,9 @@ class Relay:
             self._listener = None
 
     def _refuse(self) -> None:
-        """Hosts hear "connection refused", and no other program takes the port.
+        """Let hosts get "connection refused" while no other program can take the port.
 
-        A UDP socket that is connected hears its peer alone. Connected to itself, the socket hears nobody.
+        A connected UDP socket receives from its peer only. Connected to itself, the socket receives nothing.
         """
         self._close_listener()
         self._place = _socket()
@@ -126,7 +126,7 @@ class Relay:
                 datagram, sender = sock.recvfrom(2048)
             except BlockingIOError:
                 return
-            except OSError:  # an ICMP error of a peer that has gone: over UDP nobody says goodbye
+            except OSError:  # an ICMP error of a peer that has gone
                 return
             now = time.monotonic()
             if host is None:

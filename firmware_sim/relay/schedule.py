@@ -12,13 +12,13 @@ from firmware_sim.relay.kinds import RelayError
 LARGEST_FILE = 1 << 20  # bytes
 MOST_FAULTS = 1000
 _INTEGER_KEYS = {"skip", "count", "distance", "bits", "copies"}
-_RENAMED = {"from": "start", "until": "end"}  # as one would write it; `from` is no name in Python
+_RENAMED = {"from": "start", "until": "end"}  # names in the file; `from` cannot be a field in Python
 
 
 def load_schedule(path: Path) -> tuple[list[Fault], int | None]:
     """The faults of a file, in its order, and its `seed` if it has one.
 
-    Raises: RelayError naming the file and what is wrong with it.
+    Raises: RelayError naming the file and the error.
     """
     try:
         if path.stat().st_size > LARGEST_FILE:

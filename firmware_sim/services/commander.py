@@ -50,7 +50,7 @@ class SetpointService:
         return []
 
     def _offer(self, setpoint: np.ndarray, tick: int) -> None:
-        """The firmware would fly into NaN; a simulator ignores what is not a number."""
+        """Hand on a setpoint; values that are not numbers are ignored, unlike in the firmware."""
         if np.isfinite(setpoint).all():
             self._arbiter.offer(setpoint, CRTP, tick)
 
@@ -94,7 +94,7 @@ class HighLevelService:
     # Setpoints, 100 Hz.
 
     def setpoint(self) -> np.ndarray | None:
-        """The setpoint of the plan; null (motors off) when idle, None when there is nothing to say."""
+        """The setpoint of the plan; null (motors off) when idle, None without a setpoint."""
         try:
             goal = self.planner.goal(self._clock() / 1000.0)
             setpoint = None if goal is None else setpoint_of(goal)
@@ -137,7 +137,7 @@ class HighLevelService:
         try:
             error = self._command(data[0], data[1:])
         except (struct.error, IndexError, ValueError, ArithmeticError):
-            error = ENOEXEC  # too short, a trajectory that reaches past the memory, or numbers that lead nowhere
+            error = ENOEXEC  # too short, a trajectory beyond the memory, or invalid numbers
         return [(channel, data[:3].ljust(3, b"\0") + bytes((error,)))]
 
     def _get(self, name: str) -> float:

@@ -10,7 +10,7 @@ from firmware_sim.commander.supervisor import Supervisor
 
 POSITION, GENERIC, POSITIONS_PACKED = 0, 1, 2
 EMERGENCY_STOP, EMERGENCY_STOP_WATCHDOG, POSE, POSE_PACKED = 3, 4, 8, 9
-OWN_ID = 0xE7  # last byte of the default radio address: which entry of a packed packet is ours
+OWN_ID = 0xE7  # last byte of the default radio address: marks this drone's entry in a packed packet
 
 
 class LocalisationService:

@@ -95,7 +95,7 @@ class LogService:
             return ENOENT
         for start in range(0, len(operations) - 2, 3):
             type_byte, index = struct.unpack_from("<BH", operations, start)
-            kind = LOG_TYPE_NAME.get(type_byte & 0x0F)  # the high nibble is no storage type to trust
+            kind = LOG_TYPE_NAME.get(type_byte & 0x0F)  # the storage type in the high nibble is not reliable
             item = self.table.get(index)
             if kind is None:
                 return ENOENT
@@ -122,9 +122,9 @@ class LogService:
         return 0
 
     def _phase(self, period: int, tick: int) -> int:
-        """Up to 10 ms until the timer runs, so that no two blocks are sampled at the same instant.
+        """Delay of the timer's start, up to 10 ms, so that no two blocks are sampled at the same instant.
 
-        Over radio the starts of blocks are some ms apart; on a loopback they may come within the same millisecond.
+        Over radio the starts of blocks are some ms apart; on a loopback they may fall into the same millisecond.
         """
         span = min(period, _MAX_PHASE)
         taken = {block.nominal % period for block in self.blocks.values() if block.nominal is not None}

@@ -1,7 +1,7 @@
-"""Port 4, the memories; and what survives a reboot, the stored values of persistent parameters (the drone's EEPROM).
+"""Port 4, the memories; and the stored values of persistent parameters, which survive a reboot (the drone's EEPROM).
 
-Memories are that of the high-level commander's trajectories and the memory tester; no 1-wire and no EEPROM memory:
-cflib would read their headers before it goes on connecting. Stored values are in the simulator's memory, or in a JSON
+There are two memories: trajectories of the high-level commander, and the memory tester. 1-wire and EEPROM memories are
+left out, because cflib reads their headers while connecting. Stored values are in the simulator's memory, or in a JSON
 file {"group.name": value} that the next simulator reads.
 """
 
@@ -79,14 +79,14 @@ class MemoryService:
 class Storage:
     """Stored parameters, name -> value in the firmware's unit; written to `path` at every change if there is one.
 
-    Raises ServerError in one sentence where the file cannot be read or written, or holds something else.
+    Raises ServerError if the file cannot be read or written, or has another content.
     """
 
     def __init__(self, path: Path | None = None):
         self._path = path
         self.values: dict[str, float] = self._read(path) if path is not None and path.exists() else {}
         if path is not None:
-            self._write()  # a folder that is not there is told now, not in flight
+            self._write()  # a missing folder is reported now, not in flight
 
     @staticmethod
     def _read(path: Path) -> dict[str, float]:
@@ -120,6 +120,6 @@ class Storage:
         self._write()
 
     def clear(self) -> None:
-        """Forget all."""
+        """Remove all stored values."""
         self.values.clear()
         self._write()

@@ -13,7 +13,7 @@ PERSISTENT = 1  # extended type
 
 
 class ParamService:
-    """Reads and writes live values; `storage` holds what a client has stored for the next boot."""
+    """Reads and writes live values; `storage` holds values that a client has stored for the next boot."""
 
     def __init__(self, table: Table, defaults: Mapping[str, float], written: Callable[[str], None], storage: Storage):
         self.table = table
@@ -51,7 +51,7 @@ class ParamService:
         return [(channel, reply)] if reply else []
 
     def set(self, item: Item, value: float) -> None:
-        """Write a value and let the part of the firmware that owns it know."""
+        """Write a value and notify the part of the firmware that uses it."""
         item.array[item.index] = value
         self._written(item.name)
 
@@ -95,7 +95,7 @@ class ParamService:
 
     @staticmethod
     def _has(command: int, item: Item) -> bool:
-        """Whether the parameter has what the command asks for: only persistent ones can be stored."""
+        """Whether the parameter supports the command: only persistent ones can be stored."""
         if command in {STORE, CLEAR, EXTENDED}:
             return item.persistent
         return not (item.read_only and command in {DEFAULT_V1, DEFAULT})

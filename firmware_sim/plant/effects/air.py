@@ -3,14 +3,14 @@
     v_a = R' (v - wind - gust)                      the origin's velocity through the air, body axes
     force  = -D v_a - Q |v_a| v_a                   body axes, at the geometric origin (D, Q diagonal)
     torque = (roll_per_vy v_ay, pitch_per_vx v_ax, 0) - B w
-    without any drag: force = WIND_DRAG (wind + gust), world axes, so that wind 0 is no effect at all
+    without any drag: force = WIND_DRAG (wind + gust), world axes, so that wind 0 has no effect
     gust <- gust exp(-dt/T) + sd sqrt(1 - exp(-2 dt/T)) N(0, 1)   each world axis, stationary from the start
 
 Sources: Foerster 2015 and Faessler et al., RA-L 2018 (linear rotor drag); the Ornstein-Uhlenbeck process, exactly.
 
 vibration (not in the catalogue): torque A (cos p, sin p, 0) in body axes that turns with one rotor, dp/dt = +- ratio
-* rotor speed; its exact average over each step. cable_spring (neither): force stiffness (r - length) towards a fixed
-point of the world at distance r, from the geometric origin, none when slack (r < length); undamped.
+* rotor speed; its exact average over each step. cable_spring (also not there): force stiffness (r - length) on the
+geometric origin towards a fixed point of the world at distance r; zero when slack (r < length); undamped.
 """
 
 import math

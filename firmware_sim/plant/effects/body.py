@@ -1,4 +1,4 @@
-"""Mass properties: payload, center_of_mass, inertia, inertia_products. Steiner's theorem, and nothing else.
+"""Mass properties: payload, center_of_mass, inertia, inertia_products, by Steiner's theorem.
 
     M = m + m_p;  c = (m c_0 + m_p r) / M;  J = J_0 + m S(c_0 - c) + m_p S(r - c),  S(d) = |d|^2 I - d d'
 
@@ -27,7 +27,7 @@ class Body:
 def loaded_body(
     mass: float, inertia: np.ndarray, effects: Mapping[str, Values], load: Sequence[tuple[float, Sequence[float]]]
 ) -> Body:
-    """The body that flies: the vehicle's, with the effects on its mass and inertia. Absent effects change no bit.
+    """The vehicle's body with the effects on its mass and inertia. Absent effects change no bit.
 
     load: point masses [kg] with their places [m, body], attached one after the other.
     """

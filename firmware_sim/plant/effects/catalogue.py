@@ -1,8 +1,8 @@
 """The catalogue of effects: names, parameters, units, neutral values and ranges, and the check of a scenario's tables.
 
 Source of names and units: the catalogue that host and simulator share (docs: firmware_sim_effects.md). An effect whose
-parameters are all neutral changes nothing, not even the last bit. `HIDDEN` lists effects outside the catalogue, for
-tests of what a diagnosis says about physics it does not know.
+parameters are all neutral changes no bit. `HIDDEN` lists effects outside the catalogue, for tests of a diagnosis on
+physics without a model.
 """
 
 import math
@@ -19,7 +19,7 @@ STREAMS = ("pose", "gyro", "accelerometer", "state")
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of an effect: its unit, the value it has when left out (None: the vehicle's own), its range."""
+    """One number of an effect: its unit, default (None: the vehicle's own value) and range."""
 
     name: str
     unit: str
@@ -125,7 +125,7 @@ HIDDEN: dict[str, Effect] = {
 
 
 def parse_effects(table: Mapping[str, Any], source: str, section: str) -> dict[str, Values]:
-    """Check the tables [section.NAME] of a file; section is "effects" or "hidden". Every parameter comes out, in SI.
+    """Check the tables [section.NAME] of a file; section is "effects" or "hidden". Returns every parameter, in SI.
 
     Raises ScenarioError naming file and key.
     """

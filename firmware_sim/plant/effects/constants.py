@@ -1,4 +1,4 @@
-"""From the effects of a scenario to the constants that the compiled plant reads (layout.py), neutral ones included."""
+"""Constants of the compiled plant (layout.py) from the effects of a scenario, neutral ones included."""
 
 import math
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ def fill_effects(
 ) -> None:
     """Set the constants of all effects in c; bare_mass [kg]: without payload; com [m]: of the loaded body.
 
-    motor_lag, and what effects/body.py does, is expected to be in c already.
+    c already contains motor_lag and the mass properties of effects/body.py.
     """
     fx = {name: effects.get(name, neutral(effect)) for name, effect in EFFECTS.items()}
     c[at.COM : at.COM + 3] = com
@@ -36,7 +36,7 @@ def fill_effects(
 
 
 def neutral(effect: Effect) -> Values:
-    """The values of an effect that is not there."""
+    """The values of an absent effect."""
     values: Values = {p.name: 0.0 if p.required else p.default for p in effect.parameters}
     return {**values, "streams": ()} if effect.streams else values
 

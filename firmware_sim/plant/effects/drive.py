@@ -1,23 +1,23 @@
 """Rotors with effects, in their order: input_delay and sticky_rotor, lag, thrust and torque effects, rotor_inertia.
 
-They take the place of rotors.lag and rotors.wrench.
+They replace rotors.lag and rotors.wrench.
 
 input_delay: the command of t acts at t + delay, exactly, also between two milliseconds; the log shows it undelayed.
-sticky_rotor: one rotor keeps its command until the wanted one is more than `deadband` (of full scale) away.
+sticky_rotor: one rotor keeps its command until the new one differs by more than `deadband` (of full scale).
 
     goal   = clip(f + slope_error (f - f_hover), 0, thrust_max) (1 + gain_per_volt (V - 3.7 V))  before the lag
            = ...                                               (1 + gain_per_second t)           t since take-off
     thrust = lagged * thrust_scale * fault * (1 + strength exp(-z / height))                     after the lag
 
 f: the thrust curve's value for the command; f_hover: a quarter of the vehicle's weight without payload; V: the voltage
-at the battery's terminals; z: height of the geometric origin above the floor. What is before the lag moves the rotor's
-speed, what is after it does not. A rotor's drag torque follows its thrust. torque_scale multiplies the three torques of
-the rotors about the geometric origin; trim adds a torque that goes with their whole thrust.
+at the battery's terminals; z: height of the geometric origin above the floor. Effects before the lag change the
+rotor's speed, effects after it do not. A rotor's drag torque is proportional to its thrust. torque_scale multiplies the
+three torques of the rotors about the geometric origin; trim adds a torque proportional to their total thrust.
 
     J dw/dt = ... - w x (H e3) - dH/dt e3,   W_i = sqrt(f_i / rotor_constant)
 
-I: of one rotor and propeller about its axis, kg m^2 (the body's J holds the rotors as if they stood still). f_i: the
-lagged thrust, without what rotor_fault and the like do to it. M1 and M3 turn counter-clockwise seen from above. The
+I: of one rotor and propeller about its axis, kg m^2 (the body's J contains the rotors at rest). f_i: the lagged
+thrust, without rotor_fault and other effects after the lag. M1 and M3 turn counter-clockwise seen from above. The
 spin-up reaction is the exact change of H over each step. Source: Euler's equation of a gyrostat.
 """
 
@@ -45,7 +45,7 @@ NOMINAL_VOLTS = 3.7  # V, where battery_sag is neutral: the nominal voltage of a
 
 @kernel
 def settled_thrust(truth, state, pwm):
-    """Thrust [N] that the lag of one rotor goes to under this command."""
+    """Steady thrust [N] of one rotor under this command, the goal of its lag."""
     f = steady_thrust(truth, pwm, state[at.VOLTS])
     if pwm > 0.0 and truth[at.SLOPE_ERROR] != 0.0:
         f += truth[at.SLOPE_ERROR] * (f - truth[at.HOVER_THRUST])
@@ -79,7 +79,7 @@ def acting_wrench(truth, thrust, u):
 
 @kernel
 def store_commands(truth, state):
-    """Put the commands of this millisecond (CLOCK) into the ring, the sticky rotor's as it follows them."""
+    """Put the commands of this millisecond (CLOCK) into the ring; of the sticky rotor, the held one."""
     row = at.COMMANDS + 4 * (int(state[at.CLOCK]) % at.DELAY_ROWS)
     for i in range(4):
         pwm = state[at.PWM + i]
@@ -94,7 +94,7 @@ def store_commands(truth, state):
 def delayed_command(truth, state, i, part):
     """Command of motor i in part 0 (the first delay - floor(delay) ms) or part 1 (the rest) of this millisecond."""
     back = math.floor(truth[at.INPUT_DELAY]) + (1 - part)
-    row = (int(state[at.CLOCK]) - back) % at.DELAY_ROWS  # not yet written, so 0, before the first command acts
+    row = (int(state[at.CLOCK]) - back) % at.DELAY_ROWS  # 0 (not yet written) before the first command acts
     return state[at.COMMANDS + 4 * row + i]
 
 
@@ -116,7 +116,7 @@ def rotors_step(truth, state, dt, mean, u):
 
 @kernel
 def count_airborne_time(state):
-    """One millisecond more since the feet left the floor."""
+    """Add one millisecond to the time since the feet left the floor."""
     if state[at.AIRBORNE] > 0.0 or state[at.FEET] == 0.0:
         state[at.AIRBORNE] += 1.0
 

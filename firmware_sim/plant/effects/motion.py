@@ -1,8 +1,8 @@
-"""Everything that acts on a body with effects, about its centre of mass c; stands in for ground.contact in the body.
+"""Forces and torques on a body with effects, about its centre of mass c; with effects they replace plain contact.
 
 Floor, air, cable and the forces of `external` act at the geometric origin, b = -c from the centre of mass: the force
-passes, and the torque gains b x force. The state's position and velocity are those of the centre of mass; `origin` and
-`origin_velocity` give those of the geometric origin, which is what positions, truth files and feet refer to.
+stays, and the torque gains b x force. The state's position and velocity are those of the centre of mass; `origin` and
+`origin_velocity` give those of the geometric origin, to which positions, truth files and feet refer.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ from firmware_sim.plant.rigid_body import GRAVITY, contact
 
 @kernel
 def act(truth, x, u, force, torque, ambient, R, f, t, v):
-    """f [N, world] and t [N m, body, about the centre of mass] = what acts on a body in state x; no weight, no load.
+    """Set f [N, world] and t [N m, body, about the centre of mass] of a body in state x, without weight and load.
 
     u: [F, Mx, My, Mz] of the rotors. force, torque: held over the step, at the origin. ambient: velocity of the air
     [m/s, world] and the rotors' angular momentum [N m s]. v = velocity of the origin. Returns the feet on the floor.
@@ -72,7 +72,7 @@ def ambient_forces(truth, state, ambient):
 
 @kernel
 def static_forces(truth, state, ambient, force, torque, out_force, out_torque):
-    """What acts on a drone that stands still, besides floor and weight: held, of the air and of the cable."""
+    """Forces on a drone that stands still, without floor and weight: external, air and cable."""
     R, p, v = np.empty((3, 3)), np.empty(3), np.empty(3)
     matrix(state, at.QUAT, R)
     origin(truth, state, p, v)

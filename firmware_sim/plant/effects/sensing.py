@@ -1,15 +1,15 @@
-"""What is seen late or wrong: attitude_misalignment, accelerometer_misalignment, gyro_bias, velocity_scale,
+"""Delayed or wrong measurements: attitude_misalignment, accelerometer_misalignment, gyro_bias, velocity_scale,
 measurement_delay, rotor_sensor, and the hidden magnetic_yaw.
 
     pose fix      p = origin + noise,  q = q_z(A sin(2 pi x / wavelength)) * q_body * q_P * noise  (built-in fixes)
     accelerometer S' f_body + noise,   S = Rz(yaw) Ry(pitch) Rx(roll): the sensor's axes in the body; q_P likewise
                   (effects/step.py turns it)
     gyro          w + bias + noise     (the bias is set at boot, flight.py)
-    reported v    velocity_scale * v   each world axis, after the filter: controllers and log see it, not the filter
+    reported v    velocity_scale * v   each world axis, after the filter: for controllers and log, not for the filter
     rpm           scale * rpm          the log only (controllers/externalise.py)
 
-measurement_delay hands out what was true (pose) or known (gyro, accelerometer: after their filters; state: the logged
-estimate only) `delay` ago, linearly interpolated between milliseconds.
+measurement_delay gives the values of `delay` ago, linearly interpolated between milliseconds: of the true pose, of gyro
+and accelerometer after their filters, or of the state (the logged estimate only).
 """
 
 import math
@@ -47,7 +47,7 @@ def fix_pose(truth, state, sensor, tick, p, q):
 
 @kernel
 def origin_pose(truth, state, pose):
-    """pose = position of the geometric origin and attitude, as they are."""
+    """pose = true position of the geometric origin and true attitude."""
     v = np.empty(3)
     origin(truth, state, pose, v)
     for i in range(4):
@@ -73,8 +73,8 @@ def store_sample(sensor, ring, width, tick, values):
 
 @kernel
 def delayed_sample(sensor, ring, width, tick, delay, values, quaternion):
-    """values = those of `delay` ms ago; a quaternion starts at index `quaternion` (-1: none). Before enough time has
-    passed, the first values stand for all earlier ones."""
+    """values = those of `delay` ms ago; a quaternion starts at index `quaternion` (-1: none). In the first
+    `delay` ms they are the first values."""
     whole = math.floor(delay)
     part = delay - whole
     near = ring + width * (max(tick - whole, 0) % at.DELAY_ROWS)
@@ -94,7 +94,7 @@ def delayed_sample(sensor, ring, width, tick, delay, values, quaternion):
 
 @kernel
 def delay_sensors(truth, state, sensor, tick):
-    """Keep this tick's pose for fixes that come late; replace its filtered gyro and accelerometer by delayed ones."""
+    """Store this tick's pose for delayed fixes; replace the filtered gyro and accelerometer by delayed ones."""
     if truth[at.DELAY_POSE] > 0.0:
         pose = np.empty(7)
         origin_pose(truth, state, pose)
@@ -110,7 +110,7 @@ def delay_sensors(truth, state, sensor, tick):
 
 @kernel
 def scale_velocity(truth, sensor, estimate):
-    """Keep the estimate as it is, and let it claim the scaled velocity until `restore_estimate`."""
+    """Save the estimate and scale its velocity until `restore_estimate`."""
     for i in range(10):
         sensor[at.KEPT + i] = estimate[at.E_POS + i]
     for i in range(3):
@@ -119,7 +119,7 @@ def scale_velocity(truth, sensor, estimate):
 
 @kernel
 def delay_estimate(truth, sensor, estimate, tick):
-    """Let estimate, gyro and accelerometer be those of the delayed state until `restore_estimate`."""
+    """Replace estimate, gyro and accelerometer by delayed ones until `restore_estimate`."""
     values = np.empty(16)
     for i in range(10):
         values[i] = estimate[at.E_POS + i]

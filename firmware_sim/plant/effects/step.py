@@ -1,6 +1,6 @@
-"""The step of a body with effects: rigid_body.body_step with all of motion.py, and a suspended load's six states.
+"""The step of a body with effects: rigid_body.body_step with the forces of motion.py and a suspended load (six states).
 
-Runge-Kutta of fourth order on x = [p, v, q, w (13), n, dn/dt (6)], then the process noise, which a taut string shares.
+Runge-Kutta of fourth order on x = [p, v, q, w (13), n, dn/dt (6)], then the process noise, which acts on the load, too.
 """
 
 import math
@@ -20,7 +20,7 @@ from firmware_sim.plant.rotors import battery_step, lag, wrench
 
 @kernel
 def plant_step_with_effects(truth, state, noise, dt):
-    """One tick of rotors, battery and body under the present PWM; what has no effects moves as ever, to the bit."""
+    """One tick of rotors, battery and body under the present PWM; parts without effects run the plain step."""
     mean, u, force, torque = np.empty(4), np.empty(4), np.zeros(3), np.zeros(3)
     if truth[at.EFFECT_ROTORS] > 0.0:
         rotors_step(truth, state, dt, mean, u)
@@ -41,7 +41,7 @@ def plant_step_with_effects(truth, state, noise, dt):
 
 @kernel
 def hold_step(truth, state):
-    """A tick in which the plant does not move, because its integration step is longer: commands and clocks go on."""
+    """A tick within a longer integration step: the plant does not move; commands and clocks go on."""
     if truth[at.EFFECT_ROTORS] > 0.0:
         store_commands(truth, state)
         count_airborne_time(state)
@@ -128,7 +128,7 @@ def add_process_noise(truth, x, R, noise, dt, dv, dw):
 
 @kernel
 def rest_on_floor(truth, state, R):
-    """Nothing moves: the drone stands on its feet, and its load hangs still."""
+    """Set the state at rest: the drone stands on its feet, and its load hangs still."""
     matrix(state, at.QUAT, R)
     for i in range(3):
         state[at.VEL + i] = 0.0
@@ -140,7 +140,7 @@ def rest_on_floor(truth, state, R):
 
 @kernel
 def set_accelerometer(truth, state, R, force):
-    """Set what the accelerometer, in its own axes, feels of a specific force [m/s^2, world]."""
+    """Set the accelerometer, in its own axes, from a specific force [m/s^2, world]."""
     bx = R[0, 0] * force[0] + R[1, 0] * force[1] + R[2, 0] * force[2]
     by = R[0, 1] * force[0] + R[1, 1] * force[1] + R[2, 1] * force[2]
     bz = R[0, 2] * force[0] + R[1, 2] * force[1] + R[2, 2] * force[2]

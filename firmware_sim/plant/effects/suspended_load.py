@@ -19,7 +19,7 @@ from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.motion import gyroscopic
 from firmware_sim.plant.rigid_body import GRAVITY
 
-SWING_LIMIT = 200.0  # 1/s; keeps absurd scenarios finite
+SWING_LIMIT = 200.0  # 1/s; keeps extreme scenarios finite
 
 
 @kernel
@@ -116,7 +116,7 @@ def hook_impulse(cx, cy, cz, R, dv, dw, out):
 
 @kernel
 def normalise_string(x):
-    """Take the integration's drift out: n to unit length, dn/dt across it and within limits."""
+    """Remove the drift of integration: n to unit length, dn/dt perpendicular to n and within limits."""
     size = math.sqrt(x[13] ** 2 + x[14] ** 2 + x[15] ** 2)
     along = 0.0
     for i in range(3):
@@ -128,7 +128,7 @@ def normalise_string(x):
 
 @kernel
 def rest_load(state):
-    """The load straight below the hook and at rest."""
+    """Put the load vertically below the hook, at rest."""
     for i in range(3):
         state[at.LOAD + i] = -1.0 if i == 2 else 0.0
         state[at.LOAD_RATE + i] = 0.0
