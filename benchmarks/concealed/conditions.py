@@ -1,8 +1,8 @@
-"""What is not hidden, drawn for each case of a random world: sensors, log, controller, course, battery, days, air.
+"""Draws the properties that are not hidden in a random world: sensors, log, controller, course, battery, days, air.
 
-Everything is the true drone's. What its vehicle file does not hold is either the noise of every flight, or in the list
-`aside` of the case: effects of which nothing an answer says is judged. Ranges are those of issue and recordings; each
-drawer says its unit. Plain tables, so that a case is one JSON document.
+All are properties of the true drone. Those missing in its vehicle file are noise of every flight, or effects in the
+list `aside` of the case, which are not judged in an answer. Ranges are from the issue and from recordings. Results are
+plain tables, so that a case is one JSON document.
 """
 
 from collections.abc import Iterable
@@ -15,26 +15,26 @@ from .sizes import DEGREE, Concealed, Random, between
 
 Table = dict[str, Any]
 
-BRUSHLESS = 0.3  # share of cf21bl where either drone would do
-FAVOURABLE = 0.75  # share of flights in which the effect can be seen well; the others are of any style
+BRUSHLESS = 0.3  # share of cf21bl if the effect is possible on both drones
+FAVOURABLE = 0.75  # share of flights with a style that shows the effect well; the others have any style
 FACTOR = (0.3, 3.0)  # of the noise of gyro, accelerometer and pose, around the simulator's
 UNREST = (0.5, 2.0)  # the same for process noise
 OFFSET = (0.05 * DEGREE, 0.3 * DEGREE)  # rad/s, sd of a flight's gyro offset on each axis
-GAIN, EACH = 0.22, 0.08  # a loop's gains together, and each: in all 30 % at most
+GAIN, EACH = 0.22, 0.08  # relative change of all gains of a loop, and of each: at most 30 % in total
 LOSS = 0.05  # share of packets, at most
 PERIODS, SHARES = (20, 10, 5, 4, 2), (0.2, 0.4, 0.2, 0.1, 0.1)  # ms: 50 to 500 Hz
 STYLES = ("hover", "excite", "figure8", "fast", *MADE)
-# A style of the home world suits what is hidden; these do as well.
+# Styles that show an effect as well as the style of the home world.
 LIKE = {"figure8": ("helix", "oval"), "fast": ("star", "oval"), "excite": ("multisine", "vertical")}
 # Of drones with a file of their own: sd of trim (m of torque over thrust) from drone to drone, and from day to day with
 # the thrust (relative) and the lag, as on CrazyPAD's two drones (docs/results/diagnosis_real.md); heavy tails.
 OWN_TRIM, DAY_TRIM, DAY_THRUST, DAY_LAG, DAY_FREEDOM = (1.0e-3, 1.0e-3, 3e-4), (5e-4, 5e-4, 1.6e-4), 0.02, 0.03, 5
-DRAG, FLAPPING = (3e-3, 9e-3), (3e-6, 2e-5)  # N s/m, N m s/m of the drone as built
+DRAG, FLAPPING = (3e-3, 9e-3), (3e-6, 2e-5)  # N s/m, N m s/m of the true drone
 DRAUGHT = (0.05, 0.25)  # m/s, sd
 WINDY = {"wind", "gusts"}
 AIRY = WINDY | {"linear_drag", "quadratic_drag", "velocity_moment", "velocity_scale", "rate_damping"}
 
-# What must be logged, else no flight could show the effect.
+# Effects that need a logged voltage; without this signal no flight shows them.
 VOLTAGE = {"payload", "thrust_scale", "battery_sag", "thrust_curve", "suspended_load"}
 ONBOARD = {"velocity_scale"}
 POSED = {"attitude_misalignment", "magnetic_yaw", "accelerometer_misalignment"}
@@ -64,22 +64,22 @@ GAINS: dict[str, dict[str, tuple[str, ...]]] = {
 NUMBER = {"pid": 1, "mellinger": 2, "lee": 5, "lqg": 6}  # stabilizer.controller
 FITTING_THRUST = (
     132000.0 / 1.61
-)  # ctrlMel.massThrust that makes the wanted force on a cf21bl (docs/reference/firmware_sim.md)
+)  # ctrlMel.massThrust with the desired force on a cf21bl (docs/reference/firmware_sim.md)
 
 
 def rounded(value: float) -> float:
-    """Four digits: what stands in the files."""
+    """A value with four digits, as in the files."""
     return float(f"{value:.4g}")
 
 
 def factor(random: Random, ends: tuple[float, float]) -> float:
-    """Log-uniform between two ends."""
+    """A log-uniform number between two ends."""
     return rounded(between(float(random.random()), ends))
 
 
 def sensors(random: Random, hidden: Iterable[str]) -> Table:
     """Sections of the scenario: sensors, estimator, process noise, battery, integration step."""
-    offset = 0.02 * DEGREE if "gyro_bias" in hidden else factor(random, OFFSET)  # else the hidden one were not itself
+    offset = 0.02 * DEGREE if "gyro_bias" in hidden else factor(random, OFFSET)  # small beside the hidden one
     return {
         "sensors": {
             "gyro_noise": rounded(2.44e-4 * factor(random, FACTOR)),
@@ -126,7 +126,7 @@ def controller(random: Random, platform: str) -> Table:
 
 
 def log(random: Random, platform: str, hidden: Iterable[str]) -> Table:
-    """What is logged, how often, in which packets, and how many are lost; `needs` of what is hidden are kept."""
+    """Signals, rates and packets of the log and share of lost packets; signals that hidden effects need are logged."""
     names = set(hidden)
     onboard = bool(random.random() < 0.7) or bool(names & ONBOARD)
     state, command = (int(random.choice(PERIODS, p=SHARES)) for _ in range(2))
@@ -142,7 +142,7 @@ def log(random: Random, platform: str, hidden: Iterable[str]) -> Table:
         "loss": 0.0 if random.random() < 0.3 else rounded(float(random.uniform(0.0, LOSS))),
         "burst": rounded(float(random.uniform(1.0, 4.0))),
     }
-    if not onboard:  # errors of motion capture that hang together: markers, calibration
+    if not onboard:  # correlated errors of motion capture: markers, calibration
         out["drift"] = {
             "share": rounded(float(random.uniform(0.0, 1.0))),
             "time": rounded(float(random.uniform(0.05, 1.0))),
@@ -151,7 +151,7 @@ def log(random: Random, platform: str, hidden: Iterable[str]) -> Table:
 
 
 def air(random: Random, hidden: Iterable[str]) -> tuple[str, Table]:
-    """Drag and flapping of the drone as built: ("none", {}), ("right", effects in the file), ("free", not in it)."""
+    """Drag and flapping of the true drone: ("none", {}), ("right", effects in the file), ("free", not in the file)."""
     names = set(hidden)
     kind = str(random.choice(("none", "right", "free"), p=(0.4, 0.3, 0.3)))
     drag, flapping = factor(random, DRAG), factor(random, FLAPPING)
@@ -164,13 +164,13 @@ def air(random: Random, hidden: Iterable[str]) -> tuple[str, Table]:
 
 
 def trim(random: Random, sds: Iterable[float], *, heavy: bool) -> Table:
-    """A trim: normal from drone to drone, of a t distribution from day to day."""
+    """A trim: normally distributed over drones, t-distributed over days (heavy)."""
     draws = random.standard_t(DAY_FREEDOM, 3) if heavy else random.standard_normal(3)
     return {a: rounded(float(sd * d)) for a, sd, d in zip("xyz", sds, draws)}
 
 
 def day(random: Random, own: Table | None) -> Table:
-    """What one flight's day does: thrust and lag relative, trim [m]; nothing where the drone has no file of its own."""
+    """Changes on the day of a flight: thrust and lag (relative), trim [m]; none for a drone without its own file."""
     charge = rounded(float(random.uniform(0.55, 1.0)))
     if own is None:
         return {"charge": charge}
@@ -184,7 +184,7 @@ def day(random: Random, own: Table | None) -> Table:
 
 
 def styles(hidden: dict[str, Concealed], random: Random, *, among: tuple[str, ...] = STYLES) -> tuple[str, str]:
-    """Of the flight and of the one held out: unlike ones where the effect leaves a choice."""
+    """Styles of the fitted and of the held-out flight: different ones if several show the effect."""
     suited = [set(h.trajectories).union(*(LIKE.get(s, ()) for s in h.trajectories)) for h in hidden.values()]
     if any("low" in s for s in suited):
         return "low", "low"
@@ -198,7 +198,7 @@ def styles(hidden: dict[str, Concealed], random: Random, *, among: tuple[str, ..
 
 
 def flight(style: str, waypoints: Any, random: Random, own: Table | None) -> Table:
-    """One flight's own: course, seed, day, draught."""
+    """Properties of one flight: course, seed, day, draught."""
     out = {
         "style": style, "seed": int(random.integers(1, 2**31)), "waypoints": waypoints,
         "size": size_of(style, random), "day": day(random, own),

@@ -1,7 +1,7 @@
-"""What a drone of a drawn world is asked to fly: take-off, hover, 20 s of a style, landing, at 100 Hz.
+"""Setpoints of a flight in a drawn world: take-off, hover, 20 s of a style, landing, at 100 Hz.
 
-Styles of `crazyem fly` are those of the command; helix, vertical, oval, star and multisine are made here, in sizes and
-speeds drawn for each flight. Pure: from a table of numbers to arrays.
+Some styles are those of `crazyem fly`; helix, vertical, oval, star and multisine are made here, in sizes and speeds
+drawn for each flight. The setpoints depend only on a table of numbers.
 """
 
 import csv
@@ -101,7 +101,7 @@ def _of_the_tool(flight: Mapping[str, Any], times: NDArray, duration: float) -> 
 
 
 def _moved(style: str, size: Table, times: NDArray, duration: float) -> NDArray:
-    """(n, 4) place and yaw of a made style: its figure in full between two ramps, from the hover point and back."""
+    """(n, 4) position and yaw of a made style: from the hover point and back, with two ramps around its full size."""
     weight = np.array([window(float(t), duration=duration, ramp=RAMP)[0] for t in times])
     out = np.zeros((times.size, 4))
     angle = 2 * math.pi * times / size.get("period", 1.0)
@@ -115,7 +115,7 @@ def _moved(style: str, size: Table, times: NDArray, duration: float) -> NDArray:
         along, across = size["radius"] * np.sin(angle), size["width"] * np.cos(angle)
         c, s = math.cos(size["heading"]), math.sin(size["heading"])
         out[:, 0], out[:, 1] = c * along - s * across, s * along + c * across
-    elif style == "star":  # out to the next of five points and back to the middle
+    elif style == "star":  # to the next of five points and back to the middle
         point = np.floor(times / size["period"])
         reach = size["radius"] * np.sin(math.pi * times / size["period"]) ** 2
         out[:, 0], out[:, 1] = reach * np.cos(0.8 * math.pi * point), reach * np.sin(0.8 * math.pi * point)

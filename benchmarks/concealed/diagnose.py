@@ -1,8 +1,7 @@
-"""Runs the diagnosis on every flown case, as a process that sees two recordings and the name of the nominal vehicle.
+"""Runs the diagnosis on every flown case, as a process that gets two recordings and the name of the nominal vehicle.
 
-Or one recording, where the study says so, with nothing held out.
-
-It works in an empty folder with links to the recordings; nothing that it is given leads to the truth.
+If the study says so, it gets one recording, without a held-out one. The process works in an empty folder with links to
+the recordings, and none of its inputs leads to the truth.
 """
 
 import json
@@ -19,7 +18,7 @@ from typing import Any
 from .paths import Study, read, write
 
 DIAGNOSE = (sys.executable, "-m", "crazyem", "diagnose")
-TIME_LIMIT = 900.0  # s; an answer later than that counts as none; more on a machine that is busy otherwise
+TIME_LIMIT = 900.0  # s; a later answer counts as none; needs to be larger on a busy machine
 
 
 def diagnose_one(
@@ -65,7 +64,7 @@ def diagnose_one(
 
 
 def _same_disk(study: Study, folder: str) -> bool:
-    """Whether the recordings can be linked to so that not even a link shows where they are."""
+    """Whether hard links to the recordings are possible, which do not show their folder."""
     return os.stat(study.folder).st_dev == os.stat(folder).st_dev
 
 
@@ -82,7 +81,7 @@ def diagnose_all(
     part: tuple[int, int] = (0, 1),
     limit: float = TIME_LIMIT,
 ) -> int:
-    """Diagnose what has no answer yet; returns how many. Answers are kept: delete them to ask again."""
+    """Diagnose the cases without an answer; returns their number. Delete an answer to diagnose the case again."""
     begun, asked = time.monotonic(), 0
     for case in flown(study):
         if int(case) % part[1] != part[0] or study.answer(case).is_file():

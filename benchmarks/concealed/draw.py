@@ -1,4 +1,4 @@
-"""Draws the cases of a study from one seed: what is hidden, how strongly, on which drone, flown how."""
+"""Draws the cases of a study from one seed: hidden effects, their strength, drone and flights."""
 
 import json
 import math
@@ -16,20 +16,20 @@ from .random_world import random_case
 from .sizes import ALIKE, CATALOGUE, OUTSIDE, Concealed, Random
 
 NOTHING, PAIRS, OUTSIDERS = 0.20, 0.15, 0.10  # shares; the rest are single effects, each equally often
-BRUSHLESS = 0.12  # share of cf21bl where either drone would do
-FAVOURABLE = 0.75  # share of flights in which the effect can be seen well; the others are of any style
+BRUSHLESS = 0.12  # share of cf21bl if the effect is possible on both drones
+FAVOURABLE = 0.75  # share of flights with a style that shows the effect well; the others have any style
 STYLES = ("hover", "excite", "figure8", "fast")
 DURATION = 20.0  # s of trajectory, after take-off and 3 s of hover
 Case = dict[str, Any]
 
 
 def draw(*, cases: int, seed: int, world: str = "home") -> list[Case]:
-    """`cases` of them, in an order that tells nothing. The same seed gives the same cases.
+    """`cases` of them, in random order. The same seed gives the same cases.
 
     Each: case (its name), kind (nothing, single, pair, outside), platform, effects and hidden (tables of the scenario),
     strength (name -> 0 weak to 1 strong), flights (style, seed, waypoints or None, for "recording" and "held_out").
 
-    world: "home", in which nothing but what is hidden and how it is flown differs; "random", see `random_case`;
+    world: "home", in which only hidden effects and flights differ; "random", see `random_case`;
     "foreign", see `foreign_case`.
     """
     make, catalogue, outside = WORLDS[world]
@@ -42,7 +42,7 @@ def draw(*, cases: int, seed: int, world: str = "home") -> list[Case]:
 def _contents(
     cases: int, random: Random, catalogue: Sequence[str], others: Sequence[str]
 ) -> list[tuple[str, dict[str, float]]]:
-    """Kind and strengths of every case, of what a world can hide."""
+    """Kind and strengths of every case, with the effects that a world can hide."""
     nothing = math.ceil(NOTHING * cases)
     pairs, outside = round(PAIRS * cases), round(OUTSIDERS * cases)
     singles = cases - nothing - pairs - outside
@@ -56,7 +56,7 @@ def _contents(
 
 
 def _evenly(names: Sequence[str], count: int, random: Random) -> list[dict[str, float]]:
-    """Every name equally often (to one), its strengths spread evenly over [0, 1]."""
+    """Every name equally often (up to one), its strengths evenly over [0, 1]."""
     turns = [str(n) for _ in range(-(-count // len(names))) for n in random.permutation(names)][:count]
     out = []
     places = {name: list(random.permutation(turns.count(name))) for name in names}
@@ -104,7 +104,7 @@ def _case(name: str, kind: str, strength: dict[str, float], random: Random) -> C
 
 
 def _styles(hidden: Sequence[Concealed], random: Random) -> tuple[str, str]:
-    """Of the flight and of the one held out: different ones where the effect leaves a choice."""
+    """Styles of the fitted and of the held-out flight: different ones if several show the effect."""
     suited = [h.trajectories for h in hidden]
     if any("low" in styles for styles in suited):
         return "low", "low"
@@ -138,7 +138,7 @@ def waypoints(style: str, random: Random) -> list[dict[str, float]] | None:
 
 
 def scenario(case: Case, vehicle_file: str) -> str:
-    """The simulator's scenario file: the nominal vehicle itself, and what is hidden."""
+    """The simulator's scenario file: the nominal vehicle with the hidden effects."""
     lines = [f"platform = {json.dumps(case['platform'])}", f"vehicle_file = {json.dumps(vehicle_file)}"]
     for section in ("effects", "hidden"):
         for name, table in case[section].items():
@@ -154,7 +154,7 @@ WORLDS: dict[str, tuple[Any, Sequence[str], Sequence[str]]] = {
 
 
 def write_cases(study: Study, *, cases: int, seed: int, world: str = "home") -> int:
-    """Truth and scenario files of a drawn study; those that exist stay as they are."""
+    """Write truth and scenario files of a drawn study; existing files are kept."""
     written = 0
     for name in ("cf2", "cf21bl"):
         file = study.folder / "vehicles" / f"{name}.toml"

@@ -1,8 +1,8 @@
-"""Flies the drawn cases over the link and records them, as `crazyem fly --no-push` does. Goes on where it stopped.
+"""Flies the drawn cases over the link and records them, as `crazyem fly --no-push` does; an interrupted run continues.
 
-Link, session, setpoints, flight and recorder are those of the command. Left out is its estimator, because nobody asks
-for its estimates here, and so are its summary and plot; that halves the time of a flight. A flight with a hole
-(setpoints late, packets lost, because the machine was busy) is flown again, slower.
+Link, session, setpoints, flight and recorder are those of the command. Its estimator, summary and plot are left out,
+which halves the time of a flight. A flight with a gap (late setpoints or lost packets on a busy machine) is repeated
+at a lower speed.
 """
 
 import contextlib
@@ -38,18 +38,18 @@ from .paths import FLIGHTS, Study, read, write
 from .simulate import fly as simulate
 
 SPEED = 10.0  # firmware seconds per second, at most: the simulator waits for a host that is slower
-SLOWER = 0.6  # factor from try to try
+SLOWER = 0.6  # factor of the speed from try to try
 TRIES = 4
 LONGEST_SILENCE = 0.15  # s between setpoints; the firmware holds the last one, at 0.5 s it levels out
 MOST_LOST = 0.002  # share of packets
 AHEAD = 0.02  # s beyond the newest packet
-LOWEST, STEEPEST = 0.06, math.radians(70)  # m above the start, tilt: beyond, the drone is down, not flying
+LOWEST, STEEPEST = 0.06, math.radians(70)  # m above the start, tilt; beyond these the drone has crashed
 
 
 class NotAskedEstimator:
-    """Stands where `crazyem fly` has its estimator, and answers nothing.
+    """Replaces the estimator of `crazyem fly` and gives no estimates.
 
-    Only the command asks for a final estimate, for the summary that is left out here; a session alone does not.
+    A session needs no final estimate; only the summary of the command does, which is left out here.
     """
 
     airborne = False
@@ -63,7 +63,7 @@ class NotAskedEstimator:
 
 
 class WaitingClock(FirmwareClock):
-    """The clock of a simulator that waits, and so has no steady pace: that of its newest packet and a little."""
+    """The clock of a simulator that waits, so its speed varies: time of the newest packet plus a small advance."""
 
     _newest_at = math.nan  # s of host time
     _shown_last = -math.inf
@@ -82,7 +82,7 @@ class WaitingClock(FirmwareClock):
 
 
 class WatchedRecorder:
-    """A recorder that remembers when setpoints were sent (firmware time, s) and tells how far the log was read (ms)."""
+    """A recorder that keeps the times of setpoints (firmware time, s) and reports the newest stamp of the log (ms)."""
 
     def __init__(self, recorder: Any, seen: Any) -> None:
         self._recorder = recorder
@@ -102,7 +102,7 @@ class WatchedRecorder:
 
 
 def record(uri: str, *, vehicle_name: str, trajectory: list[str], file: Path, seen: Any) -> dict[str, Any]:
-    """One flight into `file`; what is known of its quality. Raises CrazyemError when it ended early."""
+    """Record one flight into `file`; returns its quality. Raises CrazyemError when it ended early."""
     vehicle = load_vehicle(vehicle_name)
     plan = FlightPlan(
         trajectory=trajectory_maker(trajectory, DURATION),
@@ -137,7 +137,7 @@ def record(uri: str, *, vehicle_name: str, trajectory: list[str], file: Path, se
 
 
 def looked_at(file: Path, marks: dict[str, float]) -> str:
-    """Empty, or why the flight is none: told by the recorded path alone."""
+    """The reason why the flight is invalid, by its recorded path; empty for a valid flight."""
     recording = open_recording(str(file))
     position, attitude = recording.signals["position"], recording.signals["attitude"]
     start, end = marks["trajectory_start"], marks["trajectory_end"]
@@ -165,7 +165,7 @@ def _words(flight: dict[str, Any], folder: str) -> list[str]:
 
 
 def fly_one(study: Study, case: dict[str, Any], flight: str, hangar: Hangar, *, speed: float) -> dict[str, Any]:
-    """One recording of a case, with as many tries as it takes; the record of it for the truth file."""
+    """Make one recording of a case, in several tries if needed; returns its entry of the truth file."""
     wanted, target = case["flights"][flight], study.recording(case["case"], flight)
     target.parent.mkdir(parents=True, exist_ok=True)
     reason, reasons = "", []

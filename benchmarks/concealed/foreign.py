@@ -1,7 +1,7 @@
 """Flies a case of a foreign world in RotorPy, under that simulator's own controller, and writes its log as a table.
 
-The plant is RotorPy's, with the drawn parameters; what that simulator has no parameter for (one rotor's thrust, a
-push) enters where its forces are summed. Log and mapping: `logs`. The same case gives the same file.
+The plant is RotorPy's, with the drawn parameters. Effects without a parameter there (one rotor's thrust, a push) are
+added to its sum of forces. Log and mapping: `logs`. The same case gives the same file.
 """
 
 import math
@@ -20,11 +20,11 @@ from .simulate import FARTHEST, LOWEST, STEEPEST, turned
 
 Table = dict[str, Any]
 BOOT = 1.0  # s on the floor before the motors start
-ROTORS = (4, 1, 2, 3)  # which of ours each of RotorPy's is: front left, front right, back right, back left
+ROTORS = (4, 1, 2, 3)  # our number of each of RotorPy's rotors: front left, front right, back right, back left
 
 
 def plant(parameters: Table, start: Table, step: float) -> Any:
-    """RotorPy's multirotor, with gains of single rotors and a push of our own."""
+    """RotorPy's multirotor with additional gains of single rotors and a push."""
     from rotorpy.vehicles.multirotor import Multirotor
 
     class Pushed(Multirotor):  # type: ignore[misc]
@@ -38,7 +38,7 @@ def plant(parameters: Table, start: Table, step: float) -> Any:
             lift = self.k_eta * float(np.sum(speeds**2))
             return force + self.push, torque + self.twist + self.trim * lift
 
-    # One step of Bogacki and Shampine for each of the simulator's: what is drawn is its length.
+    # One step of Bogacki and Shampine for each step of the simulator, whose length is drawn.
     once = {"method": "RK23", "first_step": step, "rtol": 1e-2, "atol": 1e-2}
     return Pushed(
         parameters, initial_state=start, control_abstraction="cmd_motor_speeds", enable_ground=True,
@@ -100,7 +100,7 @@ class Flown:
         self.held = self.phase = 0.0
 
     def origin(self) -> tuple[NDArray, NDArray]:
-        """Place and velocity of the middle of the rotors."""
+        """Position and velocity of the middle of the rotors."""
         if not self.com.any():
             return self.state["x"], self.state["v"]
         turn, (p, q, r), (x, y, z) = matrix(self.state["q"]), self.state["w"], -self.com
@@ -108,7 +108,7 @@ class Flown:
         return self.state["x"] + turn @ -self.com, self.state["v"] + turn @ swing
 
     def seen(self) -> Table:
-        """What sensors say now: position, velocity, attitude (x y z w), body_rate."""
+        """Present measurements: position, velocity, attitude (x y z w), body_rate."""
         n, white = self.noise, self.random.standard_normal(12)
         keep = math.exp(-self.step / n["time"])
         self.drift = keep * self.drift + math.sqrt(1.0 - keep**2) * n["share"] * self.random.standard_normal(9)
@@ -126,7 +126,7 @@ class Flown:
         }
 
     def wanted(self, time: float, seen: Table) -> NDArray:
-        """Rotor speeds that the controller asks for; 0 before and after the flight."""
+        """Rotor speeds commanded by the controller; 0 before and after the flight."""
         since = time - BOOT
         if not 0.0 <= since < self.path.time[-1]:
             return np.zeros(4)
@@ -140,7 +140,7 @@ class Flown:
         return np.clip(np.nan_to_num(speeds), 0.0, self.nominal["rotor_speed_max"])
 
     def acting(self, speeds: NDArray) -> NDArray:
-        """What the rotors make of their commands: a curve that is wrong, a rotor that sticks, a delay."""
+        """Commands that act on the rotors: after a wrong thrust curve, a sticky rotor, a delay."""
         curve = self.effects.get("thrust_curve")
         if curve:
             thrust, hover = self.nominal["k_eta"] * speeds**2, self.nominal["mass"] * 9.81 / 4.0
@@ -160,7 +160,7 @@ class Flown:
         return rows[0] + (back - whole) * (rows[1] - rows[0])
 
     def push(self, time: float) -> None:
-        """Gains of the rotors, forces and torques of this step."""
+        """Set gains of the rotors, forces and torques of this step."""
         gains, flown = np.ones(4), max(time - BOOT, 0.0)
         fault = self.effects.get("rotor_fault")
         if fault and time >= fault.get("onset_time", 0.0):
@@ -190,7 +190,7 @@ class Flown:
         return self.sensor_axes.T @ (matrix(self.state["q"]).T @ pulled)
 
     def astray(self, time: float) -> str:
-        """Empty, or why this is no flight any more."""
+        """The reason why the flight has failed; empty while it has not."""
         since = time - BOOT
         if not self.path.start <= since <= self.path.end:
             return ""
@@ -260,7 +260,7 @@ SIZES = {"position": 3, "velocity": 3, "attitude": 4, "body_rate": 3, "specific_
 
 
 def _write(drone: Flown, arrays: dict[str, NDArray], file: Path) -> Table:
-    """The log: late where something is hidden, thinned to its rate, without what is lost and what is not logged."""
+    """Write the log: with hidden delays, at its rate, without lost rows and signals that are not logged."""
     log, effects = drone.drawn["log"], drone.effects
     time = arrays.pop("time")
     late = effects.get("measurement_delay")

@@ -1,7 +1,7 @@
 """A case of a foreign world: a drone of RotorPy (extra `bench`), whose physics and controller are not ours.
 
-Effects are hidden by changing that simulator's parameters and what stands in its log; the vehicle file keeps the
-constants as published. Here: what can be hidden and how, and the vehicle file. `foreign` flies it. All SI.
+Effects are hidden by a change of RotorPy's parameters and of its log; the vehicle file has the published constants.
+This module defines the effects that can be hidden, and the vehicle file. `foreign` flies the case. All SI.
 """
 
 import importlib
@@ -19,7 +19,7 @@ from .sizes import CATALOGUE, DEGREE, FOREIGN_OUTSIDE, OUTSIDE, Random
 
 Table = dict[str, Any]
 PLATFORMS = {"crazyflie": "crazyflie_params", "crazyfliebrushless": "crazyfliebrushless_params"}
-SUPPLY = 4.0  # V, a battery that does not sag: RotorPy has none
+SUPPLY = 4.0  # V, constant: RotorPy has no battery
 HIDEABLE = (
     "payload", "thrust_scale", "rotor_fault", "center_of_mass", "linear_drag", "quadratic_drag", "velocity_moment",
     "motor_lag", "input_delay", "measurement_delay", "battery_sag", "thrust_curve", "wind", "gusts",
@@ -27,7 +27,7 @@ HIDEABLE = (
     "torque_scale", "rotor_sensor",
 )  # fmt: skip
 ABROAD = {**OUTSIDE, **FOREIGN_OUTSIDE}
-BEFORE_ROTORS = {"motor_lag", "input_delay", "thrust_curve", "battery_sag"}  # shown by commands, not by measured speeds
+BEFORE_ROTORS = {"motor_lag", "input_delay", "thrust_curve", "battery_sag"}  # visible in commands, not in speeds
 STEPS, STEP_SHARES = (2, 4, 5), (0.5, 0.3, 0.2)  # ms, of the simulator and its controller
 PERIODS = {2: (2, 4, 10, 20), 4: (4, 8, 12, 20), 5: (5, 10, 15, 20)}  # ms of the log
 PERIOD_SHARES = (0.15, 0.2, 0.4, 0.25)
@@ -37,10 +37,10 @@ MOTOR_NOISE = (0.2, 2.0)  # rad/s a step, sd: thrust noise with the memory of th
 
 
 def constants(platform: str) -> Table:
-    """RotorPy's own table of a drone, without translational lift, which no file of ours can say, and as a body can be.
+    """RotorPy's table of a drone, without translational lift (unknown to our files) and with possible inertia.
 
     The published moments of the crazyflie break the triangle inequality by 1 %: Izz is 0.98 of the sum of the others.
-    The brushless one's attitude gains swing by 13 Hz at steps of 4 ms: both drones fly with the controller's defaults.
+    The brushless drone's attitude gains oscillate at 13 Hz with steps of 4 ms: both drones use SE3Control's defaults.
     """
     module = importlib.import_module(f"rotorpy.vehicles.{PLATFORMS[platform]}")
     c = {**module.quad_params, "k_h": 0.0, "kp_att": 310.0, "kd_att": 57.0}
@@ -48,12 +48,12 @@ def constants(platform: str) -> Table:
 
 
 def hover_speed(c: Table) -> float:
-    """Of all four rotors together [rad/s]."""
+    """Sum of the four rotor speeds at hover [rad/s]."""
     return 4.0 * math.sqrt(c["mass"] * 9.81 / (4.0 * c["k_eta"]))
 
 
 def as_built(c: Table) -> Table:
-    """The published drag as effects: of the hubs at hover's rotor speeds, and how it damps turning."""
+    """The published drag as effects: of the hubs at the rotor speeds of hover, and its damping of body rates."""
     speed, arm = hover_speed(c), float(np.linalg.norm(c["rotor_pos"]["r1"]))
     tilt = speed * c["k_z"] * arm**2 / 2.0
     return {
@@ -75,7 +75,7 @@ def published(platform: str, effects: Table) -> Vehicle:
 
 
 def foreign_case(name: str, kind: str, strength: dict[str, float], random: Random) -> Table:
-    """As `random_case` describes one; "vehicle" is the file's text."""
+    """A case in the form of `random_case`; "vehicle" is the text of the vehicle file."""
     from .draw import waypoints
 
     hidden = {n: (CATALOGUE.get(n) or ABROAD[n]) for n in strength}
@@ -98,7 +98,7 @@ def foreign_case(name: str, kind: str, strength: dict[str, float], random: Rando
     filed = {**({"trim": own} if own is not None else {}), **(built if kind_of_air == "right" else {})}
     pair = conditions.styles(hidden, random, among=tuple(s for s in conditions.STYLES if s != "draught"))
     aside = [*built, "quadratic_drag", "velocity_moment"] if kind_of_air == "free" else []
-    aside += ["rate_damping"] if "linear_drag" in names else []  # the hubs' drag damps turning about z
+    aside += ["rate_damping"] if "linear_drag" in names else []  # the drag of the hubs damps the yaw rate
     return {
         "case": name,
         "world": "foreign",
@@ -121,7 +121,7 @@ def foreign_case(name: str, kind: str, strength: dict[str, float], random: Rando
 
 
 def surroundings(random: Random, hidden: set[str]) -> Table:
-    """What is not hidden: step, noise, gains (relative), log."""
+    """Draw the properties that are not hidden: step, noise, gains (relative), log."""
     step = int(random.choice(STEPS, p=STEP_SHARES))
     speeds = bool(random.random() < 0.4) and not hidden & BEFORE_ROTORS
     moving = bool(random.random() < 0.7) or bool(hidden & {"velocity_scale"})

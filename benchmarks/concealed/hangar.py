@@ -1,8 +1,8 @@
 """The simulated drones of a study, one after the other in one process, which loads its compiled code only once.
 
-Each is what `python -m firmware_sim` makes: the same firmware behind the same UDP server. Only its pace differs: until
-log packets flow it keeps real time, and then its time waits for a host that has not read them, or owes a setpoint,
-because the machine is busy. A flight is then as good as on an idle machine, and as fast as the machine allows.
+Firmware and UDP server are those of `python -m firmware_sim`. Only the speed differs: in real time until log packets
+flow; then the drone's time waits while the host has not read them or a setpoint is due. So a flight on a busy machine
+is as good as on an idle one, and as fast as the machine allows.
 """
 
 import multiprocessing
@@ -15,15 +15,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-UNREAD = 60  # ms of log that the host may have before it
+UNREAD = 60  # ms of log that the host may have unread
 UNCONTROLLED = 20  # ms without a setpoint while they are streamed; they are 7 ms apart
-PATIENCE = 0.5  # s of host time after which a host that does not answer is left behind; the link gives up after 2 s
+PATIENCE = 0.5  # s of host time for which the drone waits for the host; the link gives up after 2 s
 SETPOINTS = 7  # CRTP port; channel 0 carries setpoints, channel 1 ends them
 
 
 @dataclass(frozen=True)
 class Drone:
-    """What to simulate. scenario: TOML file; seed: of every noise; speed: firmware seconds per second."""
+    """The drone to simulate. scenario: TOML file; seed: of every noise; speed: firmware seconds per second."""
 
     scenario: Path
     seed: int
@@ -31,7 +31,7 @@ class Drone:
 
 
 def _serve(pipe: Connection, seen: Any) -> None:
-    """Process body: a Drone comes in, its port goes out, anything more ends it; None ends the process."""
+    """Process body: receives a Drone and sends its port; the next message ends the drone; None ends the process."""
     from firmware_sim.firmware import Firmware
     from firmware_sim.flight import Flight
     from firmware_sim.scenario import load_scenario
@@ -55,13 +55,13 @@ def _serve(pipe: Connection, seen: Any) -> None:
                 time.sleep(0.001)
                 return
             self.patience = time.monotonic() + PATIENCE
-            super()._advance(room if room > 0 else milliseconds)  # else packets were lost, and more must come
+            super()._advance(room if room > 0 else milliseconds)  # waited long enough: packets were lost, so go on
 
         patience = float("inf")
         pace = 1.0
 
         def heard(self, receive: Callable[[Any], None]) -> Callable[[Any], None]:
-            """The firmware's `receive`, with an ear for setpoints."""
+            """The firmware's `receive`, which also notes the time of setpoints."""
 
             def listen(packet: Any) -> None:
                 if packet.port == SETPOINTS:
@@ -93,7 +93,7 @@ def _serve(pipe: Connection, seen: Any) -> None:
                 server.run()
                 watcher.join()
                 pipe.send(server.dropped)
-        except Exception as error:  # told to the one who asked, who decides
+        except Exception as error:  # sent to the caller, who decides
             pipe.send(str(error) or repr(error))
 
 
@@ -122,7 +122,7 @@ class Hangar:
         self._answer()
 
     def _answer(self) -> int | str:
-        if not self._pipe.poll(900.0):  # the first one on a busy machine compiles for minutes
+        if not self._pipe.poll(900.0):  # on a busy machine the first drone compiles for minutes
             raise RuntimeError("the simulator does not answer")
         answer: int | str = self._pipe.recv()
         return answer

@@ -1,7 +1,6 @@
-"""What the best possible observer would say: log-likelihood ratio of the truth, and the true model's prediction error.
+"""The ideal observer, who knows the true parameters: log-likelihood ratio of the truth, and true prediction error.
 
-Both go through the tool's own likelihood and predictor, because the ideal observer is that with the true parameters.
-Where it does not apply, a case counts as detectable.
+Both use the tool's own likelihood and predictor. If the ratio is not available, a case counts as detectable.
 """
 
 import subprocess
@@ -36,11 +35,11 @@ def ideal_nats(
 ) -> float | None:
     """Log-likelihood of the recording under the true effects less that under the nominal vehicle; None: not available.
 
-    `vehicle` has what the drone has and is not hidden, whether the diagnosis is told so or not.
+    `vehicle` has all true properties that are not hidden, whether the diagnosis knows them or not.
 
-    Either model gets what suits it best, as an observer must who does not know them: noise scales, with a memory of the
-    torques or without, and what is always free. None where the likelihood of the flight is not what shows the effect:
-    an accelerometer, gusts, and what acts before rotors whose speeds are measured.
+    In either model, unknown quantities have their best values: noise scales, a memory of the torques or none, and the
+    nuisances. None if the effect does not act on the likelihood of the flight: accelerometer, gusts, and effects before
+    rotors whose speeds are measured.
     """
     seen = open_recording(str(recording), options_of(mapping))
     if _beyond(effects, seen):
@@ -53,8 +52,8 @@ def ideal_nats(
 def ideal_nats_of_each(
     recording: Path, vehicle: Vehicle, effects: Mapping[str, Mapping[str, Any]], *, mapping: Path | None = None
 ) -> dict[str, float | None]:
-    """By effect: log-likelihood of the recording under all true effects less that under all but this one, as above;
-    None: not available. Of a pair an ideal observer may see that something is there and still only one of the two."""
+    """By effect: log-likelihood of the recording under all true effects less that without this effect, as above; None:
+    not available. An ideal observer may detect a pair and still only one of its effects."""
     seen = open_recording(str(recording), options_of(mapping))
     if _beyond(effects, seen):
         return dict.fromkeys(effects)
@@ -68,7 +67,7 @@ def ideal_nats_of_each(
 
 
 def _beyond(effects: Mapping[str, Mapping[str, Any]], seen: Recording) -> bool:
-    """Whether the likelihood of the flight is not what shows these effects."""
+    """Whether these effects do not act on the likelihood of the flight."""
     return bool(ASIDE & set(effects) or (BEFORE_ROTORS & set(effects) and "rotor_speed" in seen.signals))
 
 
@@ -80,7 +79,7 @@ def _under(data: Data, start: Point, effects: Mapping[str, Mapping[str, Any]]) -
 
 
 def known_effects(vehicle: Vehicle) -> dict[str, dict[str, Any]]:
-    """What the vehicle has beside what is hidden, as a model's effects."""
+    """The vehicle's effects that are not hidden, as effects of a model."""
     return {name: dict(table) for name, table in vehicle.effects.items()}
 
 
@@ -90,8 +89,8 @@ def options_of(mapping: Path | None) -> ReadOptions:
 
 
 def _best(data: Data, point: Point, hidden: Iterable[str]) -> Fitted:
-    """What suits a model best beside its hidden effects: noise scales, memory of the torques or none, what is always
-    free, such as the trim of the day."""
+    """The best fit of the quantities beside the hidden effects: noise scales, memory of the torques or none, nuisances
+    such as the trim of the day."""
     known = [Candidate(name, (), ()) for name in hidden]
     once = refine_base(data, point, known)
     again = refine_base(data, remembering_anew(data, once.point), known)
@@ -100,7 +99,7 @@ def _best(data: Data, point: Point, hidden: Iterable[str]) -> Fitted:
 
 def held_out_error(recording: Path, vehicle_file: str, *, mapping: Path | None = None) -> dict[str, float] | None:
     """RMS error of `crazyem predict` after 0.5 s, between lift-off and landing: position m, velocity m/s, attitude rad,
-    body_rate rad/s; None while the command does not exist or refuses."""
+    body_rate rad/s; None if the command fails."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "prediction.npz"
         words = ["predict", str(recording), "--vehicle", vehicle_file, "--horizon", str(HORIZON), "--every", str(EVERY)]
@@ -118,7 +117,7 @@ def held_out_error(recording: Path, vehicle_file: str, *, mapping: Path | None =
 def errors_of(
     recording: Path, predicted: np.ndarray, time: np.ndarray, *, mapping: Path | None = None
 ) -> dict[str, float]:
-    """RMS of predicted states (n, 13) against what was recorded nearest to each time (n,), in the air only."""
+    """RMS errors of predicted states (n, 13) against the recorded state nearest to each time (n,), in the air only."""
     signals = open_recording(str(recording), options_of(mapping)).signals
     columns = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
     heights = signals["position"]

@@ -1,4 +1,4 @@
-"""One answer against one truth: what was right about it. All definitions of the score are here, in small functions."""
+"""Compares one answer with one truth. All definitions of the score are here, in small functions."""
 
 import math
 from collections.abc import Collection, Iterable, Mapping
@@ -9,7 +9,7 @@ from firmware_sim.plant.effects.catalogue import EFFECTS
 
 from .sizes import FOREIGN_OUTSIDE, OUTSIDE
 
-CONFIDENT = 0.5  # a name given with more than this is a claim
+CONFIDENT = 0.5  # confidence above which a name is a claim
 DETECTABLE = 10.0  # nats of an ideal observer
 STRONG = 2.0 / 3.0  # strength from which an effect counts as strong
 DISCRETE = ("rotor", "streams")
@@ -17,9 +17,9 @@ Document = Mapping[str, Any]
 
 
 def without(result: Document, aside: Collection[str]) -> dict[str, Any]:
-    """An answer without the names of which nothing that is said is judged: neither an alarm nor a find.
+    """An answer without the effects `aside`, which are not judged: they count neither as alarm nor as found.
 
-    A mismatch that was these alone, with nothing left unexplained, is none.
+    A mismatch by these effects alone, with nothing left unexplained, is no mismatch.
     """
     effects = [e for e in result.get("effects") or [] if e.get("name") not in aside]
     groups = [[n for n in group if n not in aside] for group in result.get("indistinguishable") or []]
@@ -36,19 +36,19 @@ def leaves_structure(result: Document) -> bool:
 
 
 def named(result: Document | None) -> list[str]:
-    """Names of the effects that an answer reports, first first; `unexplained` is none."""
+    """Names of the effects that an answer reports, in its order; `unexplained` is not an effect."""
     if not result or not result.get("mismatch"):
         return []
     return [e["name"] for e in result.get("effects") or [] if e.get("name") != "unexplained"]
 
 
 def grouped(result: Document, one: str, other: str) -> bool:
-    """Whether the answer says that it cannot tell these two apart."""
+    """Whether the answer declares these two look-alikes."""
     return any(one in group and other in group for group in result.get("indistinguishable") or [])
 
 
 def in_a_group(result: Document, name: str) -> bool:
-    """Whether the answer says that it cannot tell this from something else."""
+    """Whether the answer declares a look-alike of this effect."""
     return any(name in group and len(group) > 1 for group in result.get("indistinguishable") or [])
 
 
@@ -63,12 +63,12 @@ def credit(truth: str, result: Document | None) -> float:
 
 
 def right_pair(truth: Iterable[str], result: Document | None) -> bool:
-    """Both and only both."""
+    """Whether the answer names both effects and no other."""
     return sorted(named(result)) == sorted(truth)
 
 
 def pair_up_to_groups(truth: Iterable[str], result: Document | None) -> bool:
-    """Two effects, each one of the truth's or declared indistinguishable from it."""
+    """Whether the answer names two effects, each a true one or a declared look-alike of it."""
     names, (a, b) = named(result), tuple(truth)
     if result is None or len(names) != 2:
         return False
@@ -80,7 +80,7 @@ def pair_up_to_groups(truth: Iterable[str], result: Document | None) -> bool:
 
 
 def neutral(effect: str, parameter: str, vehicle: Vehicle) -> float:
-    """The value at which the effect is absent; the nominal vehicle's own where that is the meaning."""
+    """The value at which the effect is absent; for some parameters the nominal vehicle's value."""
     own = dict(zip(("xx", "yy", "zz"), vehicle.inertia)) | dict(zip(("xy", "xz", "yz"), vehicle.inertia_products))
     own["time_constant"] = vehicle.motor_time_constant
     default = next(p.default for p in EFFECTS[effect].parameters if p.name == parameter)
@@ -88,7 +88,7 @@ def neutral(effect: str, parameter: str, vehicle: Vehicle) -> float:
 
 
 def entry(effect: str, result: Document | None) -> Document | None:
-    """What the answer says of an effect, if it names it."""
+    """The answer's entry of an effect; None if not named."""
     if effect not in named(result) or result is None:
         return None
     found: Document = next(e for e in result["effects"] if e["name"] == effect)
@@ -96,7 +96,7 @@ def entry(effect: str, result: Document | None) -> Document | None:
 
 
 def same_rotor(table: Document, found: Document) -> bool:
-    """Whether the discrete part (which rotor, which stream) is right; where there is none, yes."""
+    """Whether the discrete parameters (rotor, stream) are right; True without any."""
     if "rotor" not in table:
         return True
     told = _value((found.get("parameters") or {}).get("rotor"))
@@ -106,7 +106,7 @@ def same_rotor(table: Document, found: Document) -> bool:
 def coverage(table: Document, found: Document) -> list[tuple[str, bool | None]]:
     """For every number of the truth: whether the 95 % interval holds it; None where the answer gives no interval.
 
-    An onset is in doubt by the length of a step only, and is judged by `onset_error`, not here.
+    An onset is uncertain by one step only; `onset_error` judges it.
     """
     out: list[tuple[str, bool | None]] = []
     for parameter, true in table.items():
@@ -124,7 +124,7 @@ def coverage(table: Document, found: Document) -> list[tuple[str, bool | None]]:
 def errors(effect: str, table: Document, found: Document, vehicle: Vehicle) -> dict[str, float]:
     """Error of every quantity relative to its departure from neutral; x, y, z (one unit) are one vector quantity.
 
-    A thrust 5 % too high, told as 6 %, is wrong by 20 %. A quantity that the answer does not give is wrong by 100 %.
+    For a thrust 5 % too high, an answer of 6 % has an error of 20 %. A missing quantity has an error of 100 %.
     """
     units = {p.name: p.unit for p in EFFECTS[effect].parameters}
     by_unit: dict[str, list[tuple[float, float]]] = {}
@@ -143,7 +143,7 @@ def errors(effect: str, table: Document, found: Document, vehicle: Vehicle) -> d
 
 
 def onset_error(table: Document, found: Document) -> float | None:
-    """s between told and true onset; None where either has none."""
+    """Time [s] between estimated and true onset; None if either is missing."""
     told = _value((found.get("parameters") or {}).get("onset_time"))
     return abs(told - table["onset_time"]) if told is not None and "onset_time" in table else None
 
@@ -176,7 +176,7 @@ def places(document: Any) -> list[tuple[str, str]]:
 
 
 def outside(name: str, result: Document | None) -> dict[str, bool]:
-    """What is right about an answer to something outside the catalogue: unexplained, axis, regime, wrong name."""
+    """Checks of an answer to physics outside the catalogue: unexplained, axis, regime, wrong name."""
     wanted = (OUTSIDE | FOREIGN_OUTSIDE)[name]
     said = bool(result and result.get("mismatch") and leaves_structure(result))
     found = places((result or {}).get("unexplained")) or places((result or {}).get("where"))
@@ -198,7 +198,7 @@ def _confidence(effect: Document) -> float:
 
 
 def claims(truth: Iterable[str], result: Document | None) -> list[tuple[float, bool]]:
-    """(confidence, right) of every name that an answer gives; the same as one of a declared group counts as right."""
+    """(confidence, right) of every name that an answer gives; a declared look-alike of a true one counts as right."""
     names, held = set(named(result)), set(truth)
     out = []
     for effect in (result or {}).get("effects") or []:

@@ -1,6 +1,6 @@
-"""What is written of a simulated flight: blocks of firmware variables (MCAP), or one table of a motion capture (CSV).
+"""The log of a simulated flight: blocks of firmware variables (MCAP), or one table of a motion capture (CSV).
 
-Blocks are sampled by timers of their own, as the firmware's are: phases apart, one sample in twenty late.
+Blocks are sampled by separate timers as in the firmware: with different phases, one sample in twenty late.
 """
 
 import csv
@@ -19,9 +19,9 @@ from firmware_sim.tables import pack, unpack
 from firmware_sim.wire import Air
 
 Table = dict[str, Any]
-EPOCH = 1.7e9  # s, host time of the first millisecond: any, and the same in every flight
-LATE, LATE_MEAN = 0.05, 1.5  # share of samples that are late, by how many ms (firmware_sim/services/log.py)
-OTHERS = 20  # ms, period of what is neither state nor command
+EPOCH = 1.7e9  # s, host time of the first millisecond: arbitrary, the same in every flight
+LATE, LATE_MEAN = 0.05, 1.5  # share of late samples, mean delay [ms] (firmware_sim/services/log.py)
+OTHERS = 20  # ms, period of variables that are neither state nor command
 CTYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t", "i8": "int8_t", "i16": "int16_t", "i32": "int32_t",
           "fp16": "FP16", "float": "float"}  # fmt: skip
 
@@ -42,7 +42,7 @@ def blocks_of(log: Table) -> list[tuple[list[str], int]]:
     quaternion = _of("stateEstimate", "qx qy qz qw") if attitude else []
     compressed = ["stateEstimateZ.quat"] if attitude else []
     told = ["supervisor.info"]
-    if log["layout"] == "card":  # the logging deck writes all in one row
+    if log["layout"] == "card":  # the logging deck writes all variables in one row
         return [([*floats, *quaternion, *gyro, *acc, *motors, *speeds, *volts, *told], state)]
     commands = ([*motors, *speeds, *volts, *told], command)
     if log["layout"] == "compact":
@@ -84,7 +84,7 @@ class BlockLog:
         return min(self._due)
 
     def sample(self, tick: int, **_: Any) -> None:
-        """Take what is due at this tick."""
+        """Take the samples that are due at this tick."""
         for i, items in enumerate(self._items):
             if self._due[i] > tick:
                 continue
@@ -103,7 +103,7 @@ class BlockLog:
         self._writer.close()
 
 
-# name -> (signal, columns, more of its entry); what a mapping says of each
+# name -> (signal, columns, more of its entry) in a mapping
 SIGNALS: dict[str, tuple[tuple[str, ...], str]] = {
     "position": (("x", "y", "z"), 'unit = "m"'),
     "velocity": (("vx", "vy", "vz"), 'unit = "m/s"'),
@@ -122,7 +122,7 @@ ROTORS_OF = ("motor_command", "rotor_speed")
 def mapping_of(signals: Iterable[str], *, onboard: bool, rotors: Sequence[int] = ()) -> str:
     """The mapping (docs/reference/formats/csv.md) of a table with these signals.
 
-    onboard: a filter on board made the attitude. rotors: which rotor each column of the four is.
+    onboard: the attitude is from an onboard filter. rotors: the rotor of each of the four columns.
     """
     lines = ["[time]", 'column = "t"', 'unit = "s"', 'clock = "drone"']
     for name in signals:

@@ -1,4 +1,4 @@
-"""The files of a study, and nothing else: what is told to whom is decided by which of these folders it is given."""
+"""The files of a study. The diagnosing process gets only the folder of the cases, not the folder of the truth."""
 
 import json
 import os
@@ -11,9 +11,9 @@ FLIGHTS = ("recording", "held_out")
 
 @dataclass(frozen=True)
 class Study:
-    """OUT/cases is what the diagnosing process is told of; OUT/truth is what it is not.
+    """The diagnosing process gets files of OUT/cases and none of OUT/truth.
 
-    Where it is given one flight `alone`, its answers are in OUT/alone instead of OUT/answers.
+    If it gets one flight `alone`, its answers are in OUT/alone instead of OUT/answers.
     """
 
     folder: Path
@@ -26,17 +26,17 @@ class Study:
         return self.folder / "truth" / f"{case}.toml"
 
     def recording(self, case: str, flight: str) -> Path:
-        """flight: "recording" or "held_out"; a table (.csv) where there is one, with the mapping beside it."""
+        """The file of a flight, "recording" or "held_out"; a table (.csv) with a mapping beside it if there is one."""
         table = self.folder / "cases" / case / f"{flight}.csv"
         return table if table.is_file() else table.with_suffix(".mcap")
 
     def mapping(self, case: str) -> Path | None:
-        """What the columns of the case's tables are; None where it has none."""
+        """The mapping of the case's tables; None without tables."""
         file = self.folder / "cases" / case / "mapping.toml"
         return file if file.is_file() else None
 
     def vehicle(self, case: str) -> Path:
-        """The vehicle file that a case of a drawn world is judged by."""
+        """The vehicle file of a case of a drawn world, given to the diagnosis."""
         return self.folder / "vehicles" / f"{case}.toml"
 
     @property
@@ -59,12 +59,12 @@ class Study:
 
 
 def read(path: Path) -> Any:
-    """A JSON file, None where there is none."""
+    """The content of a JSON file; None if missing."""
     return json.loads(path.read_text()) if path.is_file() else None
 
 
 def write(path: Path, document: Any) -> None:
-    """A JSON file, whole or not at all, so that an interrupted study can go on."""
+    """Write a JSON file completely or not at all, so that an interrupted study can go on."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part")
     part.write_text(json.dumps(document, indent=1) + "\n")

@@ -26,9 +26,9 @@ from crazyem.vehicle import Vehicle, load_vehicle
 from .diagnose import flown
 from .paths import Study, read
 
-SMOOTHING = 15  # samples of the derivative's window: 0.15 s, wide enough for the noise, short enough for the motion
+SMOOTHING = 15  # samples of the derivative's window: 0.15 s, a compromise between noise and motion
 SHARES = (0.003, 0.01, 0.03)  # thresholds of the regression, as shares of the residual's standard deviation; held out
-LEAST = 0.05  # share of variance that only this term explains, before it is named
+LEAST = 0.05  # least share of variance that only this term explains, for a term that is named
 FORCE_TERMS = {
     "thrust": "thrust_scale", "speed": "linear_drag", "speed squared": "quadratic_drag", "near floor": "ground_effect",
     "voltage": "battery_sag", "time": "battery_sag", "tilted weight": "wind", "constant": "accelerometer_misalignment",
@@ -41,7 +41,7 @@ TORQUE_TERMS = {
 
 
 def residuals(recording: Path, vehicle: Vehicle) -> tuple[NDArray, dict[str, NDArray], dict[str, NDArray]]:
-    """(n, 6) what the nominal model does not explain (m/s^2, rad/s^2, body); terms (n, 3) of force and of torque."""
+    """(n, 6) residuals of the nominal model (m/s^2, rad/s^2, body); terms (n, 3) of force and of torque."""
     flight = flight_of(open_recording(str(recording)), vehicle)
     model = Model(flight)
     point = Point(vehicle, {}, first_guess())
@@ -115,14 +115,14 @@ def named(recording: Path, vehicle: Vehicle) -> list[tuple[str, float]]:
 
 
 def _left(columns: NDArray, target: NDArray, chosen: NDArray, *, without: int = -1) -> float:
-    """Mean square left by least squares on the chosen columns but one; the rise is what only that one explains."""
+    """Mean square residual of least squares on the chosen columns, optionally without one of them."""
     keep = [i for i in np.flatnonzero(chosen) if i != without]
     found = np.linalg.lstsq(columns[:, keep], target, rcond=None)[0]
     return float(np.mean((target - columns[:, keep] @ found) ** 2))
 
 
 def main() -> None:
-    """What it names, case by case, and how often that is right."""
+    """Print the names of each case, and the share of right ones."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.concealed.pysindy", description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--cases", type=int, default=10**6)

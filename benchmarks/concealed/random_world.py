@@ -1,6 +1,6 @@
-"""A case of a random world: what is hidden as in the home world, everything else drawn too (`conditions`).
+"""A case of a random world: hidden effects as in the home world, all other properties drawn, too (`conditions`).
 
-From a case to what each side is told: the vehicle file of the diagnosis, and each flight's scenario of the simulator.
+It also makes the inputs of both sides: the vehicle file of the diagnosis, and each flight's scenario of the simulator.
 """
 
 from dataclasses import replace
@@ -14,15 +14,15 @@ from .paths import FLIGHTS
 from .sizes import CATALOGUE, OUTSIDE, Random
 
 Table = dict[str, Any]
-DRAGS = ("linear_drag", "quadratic_drag", "velocity_moment")  # one word for what a drone has as built
+DRAGS = ("linear_drag", "quadratic_drag", "velocity_moment")  # effects that count as one drag of the true drone
 BLOWN = ("gusts", "wind")
 
 
 def random_case(name: str, kind: str, strength: dict[str, float], random: Random) -> Table:
-    """As `draw` describes a case, with what is not hidden.
+    """A case as in `draw`, with the properties that are not hidden.
 
     More keys: world, aside, vehicle (the file's text), own (effects of that file), built (effects that every flight
-    has, whoever knows), conditions (of both flights), and in each flight its day.
+    has, known or not), conditions (of both flights), and in each flight its day.
     """
     from .draw import waypoints
 
@@ -63,7 +63,7 @@ def random_case(name: str, kind: str, strength: dict[str, float], random: Random
 
 
 def of_the_day(case: Table, flight: str, hidden: Table) -> Table:
-    """Trim, thrust and lag of one flight's day as effects, on top of what is hidden; or nothing."""
+    """Trim, thrust and lag of one flight's day as effects, added to the hidden ones; empty without a day."""
     today = case["flights"][flight]["day"]
     if "trim" not in today:
         return {}
@@ -77,7 +77,7 @@ def of_the_day(case: Table, flight: str, hidden: Table) -> Table:
 
 
 def scenario_of(case: Table, flight: str) -> Table:
-    """The simulator's scenario of one flight, but for the vehicle file."""
+    """The simulator's scenario of one flight, without the vehicle file."""
     drawn, mine = case["conditions"], case["flights"][flight]
     today = mine["day"]
     effects = {**case["built"], **case["effects"], **of_the_day(case, flight, case["effects"])}
@@ -91,7 +91,7 @@ def scenario_of(case: Table, flight: str) -> Table:
 
 
 def gains(case: Table) -> dict[str, float]:
-    """The controller's gains: the platform's, each times its factor; of a cost's weights (LQG) times its square."""
+    """The controller's gains: the platform's, each times its factor; weights of a cost (LQG) times its square."""
     usual = parameters.defaults(case["platform"])
     power = 2 if case["conditions"]["controller"] == "lqg" else 1
     return {name: usual[name] * by**power for name, by in case["conditions"]["gains"].items()}

@@ -1,4 +1,4 @@
-"""Collects a study from its files, scores it, writes the table that is published."""
+"""Reads a study from its files, scores it and writes the published table."""
 
 import textwrap
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from .random_world import of_the_day
 from .score import Outcome, failures, figures, wilson
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "results"
-# Where the table of a world stands in docs/results/concealed.md, and its figures beside it.
+# Place of the table of each world in docs/results/concealed.md, and of the file with its figures.
 MARKS = {
     "home": ("<!-- concealed: table -->", "<!-- /concealed -->", "concealed.json"),
     "random": ("<!-- random: table -->", "<!-- /random -->", "concealed_random.json"),
@@ -25,10 +25,10 @@ Ideal = Literal["all", "failures", "kept"]
 
 
 def outcomes(study: Study, *, ideal: Ideal = "all") -> list[Outcome]:
-    """Every flown case that was asked about.
+    """Every flown case with an answer.
 
-    What needs the truth on top is computed once and kept in OUT/ideal: of `all` with held-out predictions, of
-    `failures` the nats alone (what was named counts as detectable without), of nothing beyond what is `kept`.
+    Figures that need the truth are computed once and kept in OUT/ideal. `ideal`: "all" with held-out predictions;
+    "failures" the nats of failures alone (named cases count as detectable); "kept" computes nothing more.
     """
     kept = [_outcome(study, case) for case in study.cases() if study.answer(case).is_file()]
     wanted = {row["case"] for row in failures(kept)} if ideal == "failures" else set()
@@ -56,13 +56,13 @@ def _given(study: Study, truth: Mapping[str, Any]) -> Vehicle:
 
 
 def _unhidden(study: Study, truth: Mapping[str, Any]) -> Vehicle:
-    """The same with the drag that the drone has as built, where its file leaves that out, on the day of its flight."""
+    """The same with the true drag, if the file leaves it out, and with the changes of the day of the flight."""
     given = _given(study, truth)
     return replace(given, effects={**given.effects, **truth.get("built", {}), **_day(truth, {})})
 
 
 def _day(truth: Mapping[str, Any], hidden: dict[str, Any]) -> dict[str, Any]:
-    """What the day of the fitted flight does, on top of what is hidden."""
+    """Changes of the day of the fitted flight, added to the hidden effects."""
     return of_the_day(dict(truth), "recording", hidden) if "own" in truth else {}
 
 
@@ -71,7 +71,7 @@ def _known(study: Study, case: str) -> Path:
 
 
 def _know(study: Study, case: str, truth: Mapping[str, Any], *, held_out: bool) -> None:
-    """Keep nats of the truth on the flight and, if asked, held-out errors of nominal, fitted and true model."""
+    """Store nats of the truth on the flight and, if asked, held-out errors of nominal, fitted and true model."""
     known: dict[str, Any] = read(_known(study, case)) or {"held_out": {}}
     vehicle, mapping = _unhidden(study, truth), study.mapping(case)
     hidden = {n: _day(truth, truth["effects"]).get(n, t) for n, t in truth["effects"].items()}
@@ -94,7 +94,7 @@ def _know(study: Study, case: str, truth: Mapping[str, Any], *, held_out: bool) 
 
 
 def percent(share: dict[str, Any]) -> str:
-    """A share with the number of cases behind it."""
+    """A share with its number of cases."""
     if share["share"] is None:
         return "not measured"
     low, high = wilson(share["share"], share["n"])

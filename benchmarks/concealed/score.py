@@ -1,4 +1,4 @@
-"""The figures of issue 5 from truths and answers: plain counting, every definition stated, every failure listed."""
+"""The figures of issue 5, counted from truths and answers, with a list of all failures."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,13 +21,13 @@ EDGES = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 1.0 + 1e-9)  # of confidence
 
 @dataclass(frozen=True)
 class Outcome:
-    """One case, all that the score needs.
+    """One case with all inputs of the score.
 
     Attributes:
-        truth: see draw.draw. result: the answer's JSON without what is set `aside`, None if there was none.
-        seconds: it took.
+        truth: see draw.draw. result: the answer's JSON without the effects `aside`, None without an answer.
+        seconds: run time of the diagnosis.
         nats: of an ideal observer, None where not known. held_out: "nominal", "fitted", "true" -> quantity -> error.
-        of_each: of a pair, effect -> nats of an ideal observer for it beside the other; None or absent: not known.
+        of_each: of a pair, effect -> nats of an ideal observer for it beside the other; None or absent: unknown.
         vehicle: the nominal one that the diagnosis was given; None: the platform's.
     """
 
@@ -57,12 +57,12 @@ class Outcome:
 
     @property
     def detectable(self) -> bool:
-        """Also where no ideal observer is known: then every case counts, which can only lower the figures."""
+        """Whether an ideal observer detects the effect; True if unknown, which can only lower the figures."""
         return self.nats is None or self.nats > DETECTABLE
 
     @property
     def each_detectable(self) -> bool:
-        """Whether every effect could be detected beside the others; likewise."""
+        """Whether an ideal observer detects every effect beside the others; True if unknown."""
         return self.detectable and all(n is None or n > DETECTABLE for n in self.of_each.values())
 
 
@@ -129,7 +129,7 @@ def _vehicle(case: Outcome) -> Vehicle:
 
 
 def _rotors(cases: Iterable[Outcome]) -> list[float]:
-    """Of the named effects that have a rotor: whether it is the right one."""
+    """For each named effect with a rotor: 1.0 if the rotor is right, else 0.0."""
     out = []
     for case in cases:
         for name, table in case.truth["effects"].items():
@@ -197,7 +197,7 @@ def _held_out(cases: Iterable[Outcome]) -> dict[str, Any]:
 
 
 def _confidence(cases: Iterable[Outcome]) -> dict[str, Any]:
-    """Said confidence against how often it was right, over every name in every answer."""
+    """Stated confidence against the share of right names, over every name in every answer."""
     claims = [claim for c in cases for claim in judge.claims(c.names, c.result)]
     if not claims:
         return {"n": 0, "bins": [], "expected_calibration_error": None, "brier": None}
@@ -228,7 +228,7 @@ def _by_effect(seen: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def failures(cases: Iterable[Outcome]) -> list[dict[str, Any]]:
-    """Every detectable case that is not wholly right, with what was true and what was said."""
+    """Every detectable case that is not completely right, with truth and answer."""
     out = []
     for case in cases:
         why = _why(case)
@@ -249,7 +249,7 @@ def failures(cases: Iterable[Outcome]) -> list[dict[str, Any]]:
 
 
 def _why(case: Outcome) -> str:
-    """Empty if the case is right, or could not be detected."""
+    """The kind of failure; empty if the case is right or not detectable."""
     if case.result is None:
         return "no answer"
     if case.kind == "nothing":

@@ -1,7 +1,7 @@
 """Flies a case of a random world in this process, without link and clock: the same case gives the same file.
 
-Firmware, controllers and plant are those of `python -m firmware_sim`; setpoints enter where packets of the link would
-be decoded. What is logged is drawn with the case (`conditions.log`).
+Firmware, controllers and plant are those of `python -m firmware_sim`; setpoints enter after the decoding of packets.
+The logged signals are drawn with the case (`conditions.log`).
 """
 
 import math
@@ -25,13 +25,13 @@ from .random_world import scenario_of
 Table = dict[str, Any]
 BOOT = 1.5  # s of the clock before the motors start
 SETPOINT = 10  # ms
-LOWEST, STEEPEST, FARTHEST = 0.06, math.radians(70), 1.5  # m, tilt, m off the course: beyond, the drone is not flying
-UNREADABLE = 65535.0  # reported rpm of a telegram that did not pass its check
+LOWEST, STEEPEST, FARTHEST = 0.06, math.radians(70), 1.5  # m, tilt, m off the course; beyond, the flight has failed
+UNREADABLE = 65535.0  # reported rpm of a telegram with a wrong checksum
 RPM = 2.0 * math.pi / 60.0
 
 
 class PoseLog:
-    """The table of a laboratory without an onboard estimate: pose of motion capture and gyro, each row at one time."""
+    """The table of a laboratory without an onboard estimate: pose of motion capture and gyro, one time stamp a row."""
 
     suffix = ".csv"
 
@@ -138,9 +138,9 @@ def boot(case: Table, flight: str) -> Firmware:
 
 
 def fly(case: Table, flight: str, folder: Path, *, duration: float) -> Table:
-    """One flight into `folder`/{flight}.mcap or .csv (with mapping.toml); what is known of its quality.
+    """Record one flight into `folder`/{flight}.mcap or .csv (with mapping.toml); returns its quality.
 
-    {"flown": False, "reason": ...} where the drone came down, turned over or strayed, and no file.
+    Returns {"flown": False, "reason": ...} and writes no file if the drone crashed, turned over or left its course.
     """
     firmware = boot(case, flight)
     drone, mine, log = firmware.flight, case["flights"][flight], case["conditions"]["log"]
@@ -182,7 +182,7 @@ def fly(case: Table, flight: str, folder: Path, *, duration: float) -> Table:
 
 
 def astray(drone: Flight, wanted: NDArray) -> str:
-    """Empty, or why this is no flight any more."""
+    """The reason why the flight has failed; empty while it has not."""
     row = np.array(drone.truth_row())
     x, y = row[8:10]
     tilt = math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y))))

@@ -1,8 +1,8 @@
-"""What may be concealed: every effect of the catalogue with its range from weak to strong, and four outside of it.
+"""Effects that can be concealed: all of the catalogue with their ranges from weak to strong, and four outside of it.
 
 Sizes are drawn log-uniformly between the two ends; `u` in [0, 1] says where (weak below 1/3, strong from 2/3).
-Meaning and sign of every parameter: docs: firmware_sim_effects.md. All SI. The strong ends are what the Lee controller,
-which believes in the bare drone, still flies.
+Meaning and sign of every parameter: docs: firmware_sim_effects.md. All SI. At the strong ends the Lee
+controller with the constants of the bare drone still flies.
 """
 
 import math
@@ -20,14 +20,14 @@ Random = np.random.Generator
 
 @dataclass(frozen=True)
 class Concealed:
-    """One thing that can be hidden.
+    """One effect that can be hidden.
 
     Attributes:
         draw: (u, random, nominal vehicle) -> parameters of [effects.NAME] or [hidden.NAME].
         sizes: parameter -> (weak end, strong end), for the page; the numbers `draw` uses.
-        trajectories: styles in which it can be seen well.
+        trajectories: styles that show it well.
         platform: "" for either.
-        axes, regimes: outside the catalogue only: words one of which a right answer must name.
+        axes, regimes: outside the catalogue only: words; a right answer must contain one of them.
     """
 
     draw: Callable[[float, Random, Vehicle], Table]
@@ -129,7 +129,7 @@ def _motor_lag(u: float, random: Random, vehicle: Vehicle) -> Table:
 
 
 def _measurement_delay(u: float, random: Random, vehicle: Vehicle) -> Table:
-    # A late pose fix ("pose") is not drawn: what the onboard filter then logs is not its past, but a mixture.
+    # A late pose fix ("pose") is not drawn: the logged state of the onboard filter is then not a delayed state.
     stream = str(random.choice(("state", "gyro")))
     delay = between(u, SIZES["measurement_delay"]["delay"])
     return {"delay": _rounded(delay / 2 if stream == "gyro" else delay), "streams": [stream]}
@@ -172,7 +172,7 @@ def _inertia(u: float, random: Random, vehicle: Vehicle) -> Table:
 
 def _inertia_products(u: float, random: Random, vehicle: Vehicle) -> Table:
     size = between(u, SIZES["inertia_products"]["share of Ixx"]) * vehicle.inertia[0]
-    for _ in range(100):  # the largest, along some directions, belong to no body
+    for _ in range(100):  # large vectors along some directions are impossible for a body
         x, y, z = size * _direction(random)
         moments = np.linalg.eigvalsh(np.diag(vehicle.inertia) + np.array([[0, x, y], [x, 0, z], [y, z, 0]]))
         if moments[-1] < 0.999 * moments[:-1].sum():
@@ -277,7 +277,7 @@ CATALOGUE: dict[str, Concealed] = dict(
         _of("motor_lag", _motor_lag, *TURNING),
         _of("input_delay", _plain("delay", _ends("input_delay")), *TURNING),
         _of("measurement_delay", _measurement_delay),
-        # a wrong thrust curve keeps the brushless drone from arming: its rotors must idle within a range of rpm
+        # not on cf21bl: with a wrong thrust curve it does not arm, as its rotors must idle within a range of rpm
         _of("battery_sag", _battery_sag, platform="cf2"),
         _of("thrust_curve", _plain("slope_error", _ends("thrust_curve"), signs=BOTH), *TURNING, platform="cf2"),
         _of("ground_effect", _ground_effect, "low"),
@@ -303,11 +303,11 @@ OUTSIDE: dict[str, Concealed] = dict(
         _of("cable_spring", _cable_spring, *QUICK, axes=("x", "y", "z"), regimes=PLACES),
     )
 )  # fmt: skip
-# What only a foreign simulator does: thrust that grows with the square of the speed across the rotors.
+# Only in a foreign simulator: thrust that grows with the square of the speed across the rotors.
 FOREIGN_OUTSIDE: dict[str, Concealed] = dict(
     (_of("translational_lift", _lift, *QUICK, axes=("z",), regimes=("speed", "velocity", "airspeed", "fast")),)
 )
-# Pairs that no flight could tell from one of the two alone, or only by luck, are not drawn.
+# Pairs that no flight can distinguish from one of the two alone are not drawn.
 ALIKE: tuple[frozenset[str], ...] = (
     frozenset({"payload", "thrust_scale", "suspended_load", "center_of_mass", "inertia", "inertia_products"}),
     frozenset({"inertia", "torque_scale", "inertia_products", "rotor_inertia"}),
@@ -318,7 +318,7 @@ ALIKE: tuple[frozenset[str], ...] = (
     frozenset({"rotor_fault", "rotor_sensor", "center_of_mass"}),
     frozenset({"rotor_sensor", "battery_sag"}),  # each needs another drone
     frozenset({"rotor_sensor", "thrust_curve"}),
-    # these lower the drone under the controller's beliefs, and low flight would end on the floor
+    # these lower the drone, as the controller does not know them; low flight would end on the floor
     frozenset(
         {"ground_effect", "thrust_scale", "payload", "battery_sag", "thrust_curve", "rotor_fault", "suspended_load"}
     ),
