@@ -1,11 +1,11 @@
 """How close the product's estimator comes to the Cramer-Rao bound on the paper's flights, in figures with errors.
 
 A part is one kind of case (`PARTS`); a record is one estimate on one stretch of one flight beside its bound; a summary
-is what the records say together. Errors and bounds are of logarithms: relative, and the same for a factor up and down.
+combines records. Errors and bounds are of logarithms: relative, and symmetric for a factor up or down.
 
-Every record also holds what an efficient estimator would have said on the same data (`Bound.efficient`), so the luck of
-the draw can be told from what the estimator loses: both share the draw, and the efficient one's scatter is known.
-Stretches of one flight are counted as dependent: standard errors are jackknifed over flights.
+Every record also holds the error of an efficient estimator on the same data (`Bound.efficient`). Both share the noise,
+and the scatter of the efficient one is known: so the loss of the estimator is separated from chance. Stretches of one
+flight are dependent: standard errors are jackknifed over flights.
 """
 
 import math
@@ -33,8 +33,8 @@ class Part:
     """One kind of case.
 
     Attributes:
-        title: what it is.
-        sensors: that it is run with.
+        title: of the part.
+        sensors: used in the part.
         span: window (disjoint windows of each flight), flight (whole) or online (the running estimator at those rows).
         settings: of the simulation; P5 is the default reading.
         start: factors on the true mass and inertia to start from; None is the paper's cold start.
@@ -51,7 +51,7 @@ class Part:
     accelerometer: bool = True
 
 
-P3 = replace(P5, smooth=True, angle_gain=40.0, rate_gain=25.0)  # the reading that an earlier study judged estimators by
+P3 = replace(P5, smooth=True, angle_gain=40.0, rate_gain=25.0)  # another reading of the paper, with a smooth reference
 QUIET_SETTINGS = replace(P3, force_noise=5e-4, torque_noise=2e-5)
 START_FACTORS = (1.2, 0.7, 1.3, 0.7)
 PARTS = {
@@ -75,12 +75,12 @@ class Record:
     Attributes:
         part, sensor, seed, first, last: which stretch of which flight.
         error: (4) of mass, Ixx, Iyy, Izz.
-        sd: (4) that the estimator claims.
+        sd: (4) standard deviations of the estimator.
         inside: (4) whether the 95 % interval contains the truth.
-        bound: (4) smallest standard deviation possible.
+        bound: (4) Cramer-Rao bound of the standard deviation.
         efficient: (4) error of an efficient estimator on the same data, first order.
-        converged: as the estimator says.
-        passes: full passes, 0 where not told.
+        converged: as the estimator reports.
+        passes: full passes, 0 if unknown.
         seconds: of the estimate; online the median of the last window's updates.
     """
 
@@ -100,7 +100,7 @@ class Record:
 
 
 def settings_of(part: str) -> Settings:
-    """The settings that a part flies with.
+    """The settings of the flights of a part.
 
     Raises:
         UsageError: there is no such part.
@@ -111,7 +111,7 @@ def settings_of(part: str) -> Settings:
 
 
 def stretches(settings: Settings, span: str) -> list[tuple[int, int]]:
-    """Rows (first, last) of what is estimated from: the whole flight, or disjoint windows from its begin on."""
+    """Rows (first, last) of the data of each estimate: the whole flight, or disjoint windows from its start."""
     if span == "flight":
         return [(0, settings.steps + 1)]
     n = settings.window
@@ -165,9 +165,9 @@ def _offline(part: Part, settings: Settings, sensor: str, seed: int) -> Iterator
 
 
 def _online(part: Part, settings: Settings, sensor: str, seed: int) -> Iterator[_Said]:
-    """The estimator runs along, but the controller keeps the true parameters, so that flights are those of the rest.
+    """Run the estimator online; the controller keeps the true parameters, so the flights are those of other parts.
 
-    Its newest update is a few rows older than the flight; the bound is that of the rows it had.
+    The newest update is a few rows older than the flight; the bound uses the rows of this update.
     """
     flight = Flight(settings, seed)
     product = ProductOnline(settings, sensor, accelerometer=part.accelerometer)
@@ -193,7 +193,7 @@ def _short(values: NDArray) -> tuple[float, ...]:
 
 
 def summary(records: Sequence[Record]) -> dict[str, Any]:
-    """What records of one part and sensor say; every figure as [value, standard error] of the four parameters.
+    """Summary of the records of one part and sensor; every figure as [value, standard error] of the four parameters.
 
     Returns:
         n, flights, seeds (first and last); ratio: rms error over the bound; paired: the same with the luck of the draw
@@ -203,7 +203,7 @@ def summary(records: Sequence[Record]) -> dict[str, Any]:
         over the bound.
 
     Raises:
-        UsageError: there is nothing to sum up.
+        UsageError: there are no records.
     """
     if not records:
         raise UsageError("no records to sum up")

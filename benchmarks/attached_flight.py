@@ -54,7 +54,7 @@ MARKS = ("<!-- attached: table -->", "<!-- /attached -->")
 
 @dataclass(frozen=True)
 class Case:
-    """What a seed draws. Times in s since take-off; `left` is when the script leaves its attachment."""
+    """The case drawn by a seed. Times in s since take-off; `left`: time at which the script leaves its attachment."""
 
     seed: int
     way: str
@@ -63,17 +63,17 @@ class Case:
     land: float
     lasts: float  # of the landing
     left: float
-    extra: float  # ms the estimator takes longer for a sample
+    extra: float  # ms, additional time of the estimator for a sample
     stall_at: float
     stall_for: float
-    deaf_at: float  # telemetry does not come
+    deaf_at: float  # start of an outage of telemetry
     deaf_for: float
     delay: int  # ms, of a packet each way
     lost: float  # share of echoes
 
     @property
     def kinds(self) -> list[str]:
-        """What goes wrong."""
+        """Names of the faults."""
         found = {"slow estimator": self.extra, "stalled estimator": self.stall_for, "deaf": self.deaf_for}
         return [self.way, *(k for k, v in found.items() if v), *(["lost echoes"] if self.lost else [])]
 
@@ -103,7 +103,7 @@ def draw(seed: int) -> Case:
 
 
 class World:
-    """The drone, its pilot and time. `quiet` says whether nobody has anything to do before time goes on."""
+    """The drone, its pilot and the time. `quiet`: whether no thread has work to do before time goes on."""
 
     def __init__(self, case: Case) -> None:
         self.case, self.random = case, random.Random(f"world {case.seed}")
@@ -124,11 +124,11 @@ class World:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
-        """Let time pass from now on."""
+        """Start the time."""
         self._thread.start()
 
     def end(self) -> None:
-        """Time stands still, and nobody waits for it any more."""
+        """Stop the time and release all waiting threads."""
         with self._time:
             self._ended = True
             self._time.notify_all()
@@ -136,7 +136,7 @@ class World:
             self._thread.join(10.0)
 
     def wait(self, tick: float) -> None:
-        """Until the drone's clock shows `tick` [ms]."""
+        """Wait until the drone's clock shows `tick` [ms]."""
         me = threading.get_ident()
         with self._time:
             self._waiting.add(me)
@@ -149,7 +149,7 @@ class World:
 
     @property
     def seconds(self) -> float:
-        """Since take-off; NaN before."""
+        """Time since take-off [s]; NaN before."""
         return self.tick / 1000.0 - self.began
 
     @property
@@ -172,7 +172,7 @@ class World:
         self.firmware._written(name)
 
     def write(self, name: str, value: float) -> None:
-        """A parameter write arrives."""
+        """Handle a parameter write."""
         with self._time:  # between two steps
             self._set(name, value)
 
@@ -213,7 +213,7 @@ class World:
 
 @dataclass
 class WorldLink:
-    """A link to the world, as far as a session asks."""
+    """A link to the world, with the parts that a session uses."""
 
     world: World
     uri: str = "world://0"
@@ -239,14 +239,14 @@ class WorldLink:
         return self.world.tick / 1000.0
 
     def subscribe(self, variables: Sequence[str], rate: float) -> tuple[Block, ...]:
-        """A block a packet's size or less; every 10 ms."""
+        """Make blocks of at most a packet's size, every 10 ms."""
         types = self.log_variables
         block = Block(len(self.blocks), tuple(Variable(v, types[v]) for v in variables), STEP)
         self.blocks.append(block)
         return (block,)
 
     def step(self) -> None:
-        """What is logged in this step sets out, and what arrives is there."""
+        """Send the log packets of this step, and deliver the packets that arrive."""
         w, case = self.world, self.world.case
         if self._gone:
             return
@@ -272,11 +272,11 @@ class WorldLink:
         return float(min(max(int(value), low), high))
 
     def read_parameter(self, name: str, timeout: float = 2.0) -> float:
-        """At once."""
+        """Read a parameter without delay."""
         return self.world.read(name)
 
     def write_parameter(self, name: str, value: float, timeout: float = 1.0) -> ParameterWrite:
-        """Sent again every 0.3 s of the drone's time while no echo comes."""
+        """Write a parameter; repeat every 0.3 s of the drone's time until an echo comes."""
         w, rounded = self.world, struct.unpack("<f", struct.pack("<f", value))[0]
         begun = w.tick
         sends = 0
@@ -303,21 +303,21 @@ class WorldLink:
 
 @dataclass
 class Result:
-    """What became of a flight. `after_s`: of the last write on the ground since the drone touched it, s."""
+    """Result of a flight. `after_s`: time of the last write on the ground since touch-down, s."""
 
     seed: int
     kinds: list[str]
     writes: int
     on_ground: int
     after_s: float | None
-    behind_s: float  # by which the estimator was behind when the script left
+    behind_s: float  # delay of the estimator when the script left
     landed: bool
     stopped: str
     fault_of_ours: str = ""
 
 
 def fly(seed: int) -> Result:
-    """Draw, fly, judge."""
+    """Draw, fly and judge a case."""
     case = draw(seed)
     vehicle = load_vehicle("cf2")
     warm_up(vehicle)
@@ -378,7 +378,7 @@ def fly(seed: int) -> Result:
 
 
 def table(results: Sequence[Result]) -> str:
-    """Markdown: by way out and by what went wrong."""
+    """Markdown: results by way of leaving and by fault."""
     lines = ["| | flights | with writes | writes | on the ground |", "|---|---|---|---|---|"]
     counts = Counter(k for r in results for k in r.kinds)
     for kind in ("all", *WAYS, *sorted(set(counts) - set(WAYS))):

@@ -6,8 +6,8 @@ libegl1 libgl1 libxkbcommon0 libdbus-1-3 libfontconfig1 must be there):
     python benchmarks/cfclient_check.py udp://127.0.0.1:19850 [--seconds 5] [--timeout 60]
 
 Opens the main window with all its tabs, connects, waits until every parameter has been read, lets the client's own log
-blocks run for some seconds, writes a parameter back (a client whose parameter callbacks raised can no longer do that),
-and disconnects. Exit code 0 when that worked and nothing was logged as an error or raised in any thread, 1 otherwise.
+blocks run for some seconds, writes a parameter back (impossible after an error in a parameter callback), and
+disconnects. Exit code 0 if all worked without a logged error or an exception in any thread, 1 otherwise.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from types import TracebackType
 
 
 class Collector(logging.Handler):
-    """Keeps what was logged as an error or with an exception, and what was raised where nobody caught it."""
+    """Keeps logged errors and exceptions, and uncaught exceptions."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -53,7 +53,7 @@ def main() -> int:
     sys.excepthook = collector.raised
     threading.excepthook = lambda args: collector.raised(args.exc_type, args.exc_value, args.exc_traceback)
     with tempfile.TemporaryDirectory() as folder:
-        os.environ["XDG_CONFIG_HOME"] = folder  # a client as new: no cache, no configuration
+        os.environ["XDG_CONFIG_HOME"] = folder  # a new client: no cache, no configuration
         troubles = check(arguments.uri, arguments.seconds, arguments.timeout) + collector.troubles
     for trouble in troubles:
         print(f"TROUBLE {trouble}")
@@ -68,7 +68,7 @@ def check(uri: str, seconds: float, timeout: float) -> list[str]:
     from PyQt6.QtWidgets import QApplication, QMessageBox
 
     troubles: list[str] = []
-    for name in ("critical", "about", "warning"):  # a dialogue would wait for a click for ever
+    for name in ("critical", "about", "warning"):  # a dialogue would wait for a click
         setattr(QMessageBox, name, lambda *args: troubles.append(f"dialogue: {args[-1]}"))
     app = QApplication(["cfclient"])
     window = MainUI()
@@ -84,7 +84,7 @@ def check(uri: str, seconds: float, timeout: float) -> list[str]:
     connected, data = threading.Event(), threading.Event()
     window.cf.fully_connected.add_callback(lambda _uri: connected.set())
     window.batteryUpdatedSignal.connect(lambda *_args: data.set())
-    for tab in window.loaded_tab_toolboxes.values():  # all there are, not only those a new user sees
+    for tab in window.loaded_tab_toolboxes.values():  # all tabs, not only those that a new user sees
         window._tab_toolbox_show_as_tab(tab)
     wait(lambda: False, 1.0)  # the window's first scan
     window._connectivity_manager.set_interfaces([uri], 0)

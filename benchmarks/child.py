@@ -1,4 +1,4 @@
-"""What a command costs as a process of its own: wall time, processor time, peak memory, as the kernel counts them."""
+"""Cost of a command as a separate process: wall time, processor time, peak memory, by the kernel's counts."""
 
 import json
 import subprocess
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 CRAZYEM = [sys.executable, "-m", "crazyem"]
 
-# The peak of a process starts with that of the one it was started from, so a small one stands between.
+# The peak memory of a process starts with that of its parent, so a small process is put between.
 _BETWEEN = """
 import json, os, resource, subprocess, sys, time
 limit, *command = json.load(sys.stdin)
@@ -43,7 +43,7 @@ def measured(command: list[str], *, address_space: int = 0, check: bool = True) 
     """Run a command to its end.
 
     Args:
-        command: and its arguments.
+        command: program and arguments.
         address_space: limit in bytes (RLIMIT_AS); 0: none.
         check: raise RuntimeError with the output if the command fails.
     """

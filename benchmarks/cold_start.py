@@ -48,7 +48,7 @@ Kind = tuple[str, str, str]  # start, reference, sensor
 
 
 def version() -> str:
-    """Changes with any code that a flight depends on (not with its comments), and with the settings."""
+    """A hash of the settings and of all code that a flight depends on (without comments)."""
     digest = hashlib.sha256(repr([astuple(settings) for settings in REFERENCES.values()]).encode())
     digest.update(ast.dump(ast.parse(Path(__file__).with_name("cold_start_study.py").read_bytes())).encode())
     of_paper = ("bound", "flight", "plant", "product", "settings")
@@ -63,7 +63,7 @@ def version() -> str:
 
 
 def line_of(flight: ColdStart, *, reference: str, code: str) -> dict[str, Any]:
-    """A flight for the file: the record, and its series thinned and rounded."""
+    """A flight as a line of the file: the record, and its series thinned and rounded."""
     kept = flight.time <= SHOWN
     rows = slice(0, round(SHOWN / SMOOTH_SETTINGS.dt) + 1, 4)
     return {
@@ -103,7 +103,7 @@ def read(path: Path, *, code: str | None = None) -> dict[tuple[Kind, int], ColdS
         try:
             line = json.loads(text)
         except ValueError:
-            continue  # cut off in mid-line: flown again
+            continue  # an incomplete line: flown again
         if code is None or line["code"] == code:
             kind = ("floor" if line["ground"] else "air", line["reference"], line["sensor"])
             found[kind, int(line["seed"])] = flight_of(line)
@@ -144,7 +144,7 @@ def fly(out: Path, kinds: Sequence[Kind], seeds: Sequence[int], *, seconds: floa
 
 
 def summary(flights: Mapping[tuple[Kind, int], ColdStart]) -> dict[str, Any]:
-    """All kinds that were flown, and the single numbers of the first seeds for the check."""
+    """Summary of all kinds of flights, with single numbers of the first seeds for the check."""
     kinds = sorted({kind for kind, _ in flights})
     groups = {kind: [f for (k, _), f in sorted(flights.items()) if k == kind] for kind in kinds}
     return {
@@ -188,7 +188,7 @@ def put_table(page: str, text: str) -> str:
 
 
 def plot(path: Path, flights: Mapping[tuple[Kind, int], ColdStart], *, sensor: str, reference: str) -> None:
-    """Convergence and height of all flights with one sensor and reference, from the air and from the floor."""
+    """Plot convergence and height of all flights with one sensor and reference, from the air and from the floor."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -220,7 +220,7 @@ def plot(path: Path, flights: Mapping[tuple[Kind, int], ColdStart], *, sensor: s
 
 
 def write_docs(out: Path) -> None:
-    """Summary, plot and table of docs/results/cold_start.md from what was flown with the present code."""
+    """Write summary, plot and table of docs/results/cold_start.md from the flights of the present code."""
     flights = read(out / "flights.jsonl", code=version())
     if not flights:
         sys.exit(f"{out} holds no flights of this version of the code")
@@ -232,7 +232,7 @@ def write_docs(out: Path) -> None:
 
 
 def differences(said: Mapping[str, Any], seeds: int) -> Iterator[str]:
-    """Sentences on what is not as the stored summary says, for the first seeds of each kind (at most two)."""
+    """Sentences on differences from the stored summary, for the first seeds of each kind (at most two)."""
     for kind, stored in said["first"].items():
         start, reference, sensor = kind.split()
         for old in stored[:seeds]:

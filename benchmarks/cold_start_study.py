@@ -1,10 +1,9 @@
-"""A cold start in closed loop: the drone is flown with what the estimator says, which at first is almost nothing.
+"""A cold start in closed loop: the controller uses the estimates from the start, without knowing the parameters.
 
 The paper (XI) starts controller and estimator with a mass of 1 g for a drone of 180 g, and gives the drone new
-parameters every 20 ms. Here the estimator is the product's own, unchanged; it sees what a sensor says and what was
-commanded. Either the drone starts in the air at rest, as in the paper, or on a floor, from which thrust ramps up until
-the position sensor shows that it has lifted. Then the controller takes over, but not before the estimator has said
-anything.
+parameters every 20 ms. Here the estimator is the product's own, unchanged; its inputs are measurements and commands.
+The drone starts in the air at rest, as in the paper, or on a floor. From the floor, thrust ramps up until the position
+sensor shows lift-off. Then the controller takes over, but not before the first estimate.
 """
 
 import math
@@ -24,25 +23,25 @@ from crazyem.paper.settings import Settings
 
 NAMES = ("mass", "Ixx", "Iyy", "Izz")
 SENSORS = "ABC"
-EARLY_SECONDS = 2.5  # s after lift-off: here the estimate is held against what the data can tell
-SETTLED_SECONDS = 4.0  # s after lift-off: the window is full; from here on tracking is compared
+EARLY_SECONDS = 2.5  # s after lift-off at which the estimate is compared with the Cramer-Rao bound
+SETTLED_SECONDS = 4.0  # s after lift-off: the window is full; tracking is compared from here on
 BANDS = {"mass within 5 %": (slice(0, 1), 0.05), "mass within 1 %": (slice(0, 1), 0.01),
          "inertia within 25 %": (slice(1, 4), 0.25)}  # fmt: skip
 
 
-# What is flown unless settings are given.
+# Default settings.
 SMOOTH_SETTINGS = replace(Settings(), smooth=True)
 STEP_SETTINGS = Settings()
 
 
 @dataclass(frozen=True)
 class Settling:
-    """When an estimate came into a band around the truth [s after lift-off]; infinity for never.
+    """Time at which an estimate enters a band around the truth [s after lift-off]; infinity for never.
 
     Attributes:
         first: first time inside.
-        stays: from when on it is inside until the window is full.
-        leaves_later: whether it is outside at any time after that. That is the spread of a full window, no cold start.
+        stays: time from which on it is inside until the window is full.
+        leaves_later: whether it is outside at any later time. This is the spread of a full window, not of a cold start.
     """
 
     first: float
@@ -55,17 +54,17 @@ class ColdStart:
     """One flight with unknown parameters.
 
     Attributes:
-        seed, sensor, ground, smooth: what was flown.
-        crashed: upside down, far below the start, or no number any more.
-        lift_off: s, when the controller took over; 0 without a floor.
-        left_floor: s, when the drone truly left the floor; 0 without one.
+        seed, sensor, ground, smooth: of the flight.
+        crashed: upside down, far below the start, or not a number.
+        lift_off: s, time at which the controller takes over; 0 without a floor.
+        left_floor: s, time at which the drone truly leaves the floor; 0 without one.
         settling: band -> Settling.
-        sag: m, how far the drone fell below the height at which the controller took over.
+        sag: m, largest fall below the height at which the controller takes over.
         highest_mass: largest estimate after lift-off over the truth.
         rms: m, position error from 4 s after lift-off on; NaN if the flight ended before.
         rms_known: m, the same of a controller that knows the parameters, with the same noise.
-        touch_downs: how often it came back to the floor after lift-off.
-        contact_used: samples on the floor that the estimator took for flight.
+        touch_downs: number of returns to the floor after lift-off.
+        contact_used: samples on the floor that the estimator used as flight.
         largest_tilt: rad, of roll and pitch after lift-off.
         bound: (4,) Cramer-Rao bound of mass, Ixx, Iyy, Izz, relative, of the first 2.5 s after lift-off; NaN if the
             flight ended before.
@@ -113,10 +112,10 @@ def _plain(value: Any) -> Any:
 
 
 class Loop:
-    """Drone, controller and estimator, a row at a time; the controller acts on a row with the newest estimate.
+    """Drone, controller and estimator, row by row; in each row the controller uses the newest estimate.
 
     Attributes:
-        flight: so far.
+        flight: up to the present row.
         estimator: the product's, started from the paper's values.
         history: row and mass, Ixx, Iyy, Izz of every estimate that was fed back; row 0 is the start.
         contact_used: samples on the floor that the estimator took for flight.
@@ -131,13 +130,13 @@ class Loop:
         self._judged = 0
 
     def advance(self) -> Estimate | None:
-        """Fly one step and give the estimator what it brought; the estimate, if an update was due."""
+        """Fly one step and give its samples to the estimator; returns the estimate if an update was due."""
         flight = self.flight
         _, mass, *inertia = self.history[-1]
         waits = flight.ground and len(self.history) == 1
         flight.advance(1, mass=None if waits else mass, inertia=np.array(inertia))
         said = None
-        # the newest row again, now with its wrench: samples of one time make one node
+        # the newest row again, now with its wrench: samples with one time stamp make one node
         for sample in flight.samples(self.sensor, flight.size - 2):
             said = self.estimator.feed(sample) or said
         if self.estimator.counters.nodes > self._judged:
@@ -158,7 +157,7 @@ def cold_start(
         seed: of all noise; the two flights share it.
         sensor: A (position, specific force, body rate), B (full state) or C (position, velocity, body rate).
         ground: start on a floor.
-        smooth: whether the reference goes smoothly from waypoint to waypoint, or in steps.
+        smooth: whether the reference between waypoints is smooth or has steps.
         settings: of the simulation, `SMOOTH_SETTINGS` or `STEP_SETTINGS` by default; `smooth` overrides its own.
 
     Raises:
@@ -217,14 +216,14 @@ def _judge(loop: Loop, known: Flight, *, seed: int, crashed: bool) -> ColdStart:
 
 
 def settling(time: NDArray, inside: NDArray, *, until: float = SETTLED_SECONDS) -> Settling:
-    """When a series came into a band and from when on it stayed there.
+    """Time at which a series enters a band, and time from which on it stays there.
 
     Args:
-        time: (n,) s after lift-off, increasing; what was estimated before lift-off counts from there on.
+        time: (n,) s after lift-off, increasing; an estimate before lift-off counts from lift-off on.
         inside: (n,) bool; each holds until the next.
-        until: s; what happens later is told apart.
+        until: s; later times count for `leaves_later` alone.
     """
-    begun = max(0, int(np.searchsorted(time, 0.0, "right")) - 1)  # the one that holds at lift-off
+    begun = max(0, int(np.searchsorted(time, 0.0, "right")) - 1)  # the estimate in use at lift-off
     time, inside = np.maximum(time[begun:], 0.0), np.asarray(inside, bool)[begun:]
     n = int(np.searchsorted(time, until, "right"))
     early, late = inside[:n], inside[n:]
@@ -237,7 +236,7 @@ def settling(time: NDArray, inside: NDArray, *, until: float = SETTLED_SECONDS) 
 
 
 def _against_bound(loop: Loop, begin: int, time: NDArray, ratio: NDArray) -> tuple[tuple[float, ...], ...]:
-    """Bound of the first rows after lift-off, (4,) relative, and the error of the estimate then, in bounds."""
+    """Bound of the first rows after lift-off, (4,) relative, and the error of the estimate there over the bound."""
     flight = loop.flight
     end = begin + round(EARLY_SECONDS / flight.settings.dt)
     if end >= flight.size or (flight.ground and flight.lift_off < 0):
@@ -254,7 +253,7 @@ def _left_floor(flight: Flight) -> int:
 
 
 def _tracking(flight: Flight) -> float:
-    """rms position error [m] from 4 s after lift-off to the end, NaN if it did not get so far."""
+    """rms position error [m] from 4 s after lift-off to the end, NaN if the flight ended earlier."""
     begin = max(flight.lift_off, 0)
     first = begin + round(SETTLED_SECONDS / flight.settings.dt)
     rows = np.arange(first, flight.size)
@@ -265,7 +264,7 @@ def _tracking(flight: Flight) -> float:
 
 
 def spread(values: Sequence[float], *, largest_is_worst: bool = True) -> dict[str, float]:
-    """Median, 95th percentile and worst. Infinities count; a percentile is one of the values, nothing in between."""
+    """Median, 95th percentile and worst. Infinities count; a percentile is one of the values."""
     ordered = np.sort(np.asarray(values, float))
     if not largest_is_worst:
         ordered = ordered[::-1]
@@ -278,7 +277,7 @@ def spread(values: Sequence[float], *, largest_is_worst: bool = True) -> dict[st
 
 
 def summarise(flights: Sequence[ColdStart]) -> dict[str, Any]:
-    """What the flights of one kind have in common: counts, and spreads over the flights that did not crash."""
+    """Summary of the flights of one kind: counts, and spreads over the flights without a crash."""
     flew = [f for f in flights if not f.crashed]
     out: dict[str, Any] = {
         "flights": len(flights),

@@ -31,7 +31,7 @@ MELLINGER, INDI, LEE = 2, 3, 5  # stabilizer.controller
 AXES = "pqr"
 EXCITED, REST, STEP, AFTER = 4.0, 1.0, 0.5, 2.0  # s, s, m, s: excitation, hover, step of the place, hover
 LATERAL, ANGULAR, RAMP = 0.9, 9.0, 0.5  # m/s^2, rad/s^2, s of the excitation
-TILT_LIMIT = math.radians(10.0)  # posCtrlIndi.pq_clamping: what a step of the place asks for
+TILT_LIMIT = math.radians(10.0)  # posCtrlIndi.pq_clamping: reached by a step of the position
 WITHIN = 0.05  # of the true g1
 SPEED = 1.5  # m/s, the highest of the figure
 MARKS = ("<!-- controllers: table -->", "<!-- /controllers -->")
@@ -40,7 +40,7 @@ DOCS = Path(__file__).resolve().parents[1] / "docs" / "results" / "controller_pa
 
 @dataclass(frozen=True)
 class World:
-    """What a seed draws: SI. `inertia_factor`: estimated over true inertia in the flights with a wrong estimate."""
+    """World of a seed, SI. `inertia_factor`: estimated over true inertia in the flights with a wrong estimate."""
 
     mass: float
     inertia: tuple[float, float, float]
@@ -86,7 +86,7 @@ def true_effectiveness(scenario: Scenario, vehicle: Vehicle) -> tuple[float, ...
 
 
 def excite_and_step() -> Trajectory:
-    """Excitation, hover, then the place jumps by half a metre along x."""
+    """Excitation, hover, then a step of the position by half a metre along x."""
     shaken = excite(
         position=(0.0, 0.0, 1.0), duration=EXCITED, lateral=LATERAL, vertical=0.5, angular=ANGULAR, ramp=RAMP
     )
@@ -100,13 +100,13 @@ def excite_and_step() -> Trajectory:
 
 
 def pitch(row: Sequence[float]) -> float:
-    """rad, of a row of `GuardedFlight.rows`."""
+    """Pitch [rad] of a row of `GuardedFlight.rows`."""
     w, x, y, z = row[7:11]
     return math.asin(max(-1.0, min(1.0, 2.0 * (w * y - x * z))))
 
 
 def overshoot(flight: GuardedFlight) -> float:
-    """Of the pitch that a step of the place asks for, over that pitch: 0.1 is 11 degrees; NaN after a crash."""
+    """Overshoot of the pitch after a step of the position, relative: 0.1 is 11 degrees; NaN after a crash."""
     begun = EXCITED + REST
     seen = [pitch(row) for row in flight.rows if begun <= row[0] <= begun + 0.6]
     return max(seen) / TILT_LIMIT - 1.0 if seen and not flight.crashed else math.nan
@@ -115,7 +115,7 @@ def overshoot(flight: GuardedFlight) -> float:
 def indi(
     seed: int, start: float, *, push: bool = True, inertia_factor: float | None = None, guard: bool = True
 ) -> dict[str, Any]:
-    """One flight of INDI whose g1 is `start` times the true one at take-off, and what came of it."""
+    """Result of one flight of INDI whose g1 at take-off is `start` times the true one."""
     world, vehicle = draw(seed), load_vehicle("cf2")
     scenario = parse_scenario(world.table(), f"seed {seed}")
     true = true_effectiveness(scenario, vehicle)
@@ -205,7 +205,7 @@ def flights(seed: int) -> dict[str, Callable[[], dict[str, Any]]]:
 
 
 def load(path: Path) -> dict[int, dict[str, Any]]:
-    """Seed -> name -> result of what has been flown."""
+    """Seed -> name -> result of the finished flights."""
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     done: dict[int, dict[str, Any]] = {}
     for line in lines:
@@ -215,7 +215,7 @@ def load(path: Path) -> dict[int, dict[str, Any]]:
 
 
 def fly_all(seeds: Sequence[int], path: Path, only: Sequence[str]) -> None:
-    """Fly what is missing; a line a flight."""
+    """Fly the missing flights; writes one line for each."""
     done = load(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     for seed in seeds:
@@ -229,7 +229,7 @@ def fly_all(seeds: Sequence[int], path: Path, only: Sequence[str]) -> None:
 
 
 def table(done: dict[int, dict[str, Any]]) -> str:
-    """Markdown: what was asked for, and what came out."""
+    """Markdown: aims and results."""
 
     def of(name: str, key: str) -> list[float]:
         values = [r[name][key] for r in done.values() if name in r]

@@ -32,7 +32,7 @@ MARKS = ("<!-- measured -->", "<!-- end of measured -->")
 
 
 def crazyem(*arguments: str) -> tuple[str, float]:
-    """Run a command; its output and seconds. Raises RuntimeError with what it said if it fails."""
+    """Run a command; returns its output and seconds. Raises RuntimeError with the output if it fails."""
     begin = time.monotonic()
     done = subprocess.run([sys.executable, "-m", "crazyem", *arguments], capture_output=True, text=True, check=False)
     if done.returncode:
@@ -43,7 +43,7 @@ def crazyem(*arguments: str) -> tuple[str, float]:
 def diagnose(
     work: Path, name: str, train: Sequence[Path], held_out: Sequence[Path], vehicle: str | Path, *more: str
 ) -> dict[str, Any]:
-    """One diagnosis: what it named, its sentence, its seconds, and the fitted vehicle's path."""
+    """One diagnosis: named effects, sentence, seconds, and path of the fitted vehicle."""
     fitted, document = work / f"{name}.toml", work / f"{name}.json"
     apart = ["--held-out", *map(str, held_out)] if held_out else []
     text, seconds = crazyem(
@@ -152,10 +152,10 @@ WINDOW = 21  # samples of the Savitzky-Golay filter that accelerations come from
 
 
 def forces(path: Path, vehicle: str, withhold: Sequence[str], *, learned: bool = False) -> Judged:
-    """Residual of the specific force (n, 3) m/s^2 in body axes at recorded states, and the rms of the position error
-    after 0.5 s with the attitude as measured [m], of how many starts. `learned`: as `crazyem predict` has it, with
-    the force that was missing before each start; else the model alone. (A voltage that is withheld is that of the
-    first 3 s for the position, at earlier starts too.)"""
+    """Residual of the specific force (n, 3) m/s^2, body axes, at recorded states; rms of the position error after 0.5 s
+    with the measured attitude [m]; number of starts. `learned`: as in `crazyem predict`, with the force that was
+    missing before each start; else the model alone. (For the position, a withheld voltage is that of the first 3 s,
+    also at earlier starts.)"""
     from crazyem.diagnosis.flights.flight import without
     from crazyem.diagnosis.prediction.bias_correction import correction_weights
     from crazyem.diagnosis.prediction.horizon import errors, open_loop, windows
@@ -187,7 +187,7 @@ def forces(path: Path, vehicle: str, withhold: Sequence[str], *, learned: bool =
         grid = np.arange(time[0], time[-1], step)
         place = np.stack([np.interp(grid, time, c) for c in state[:, :3].T], 1)
         acceleration = np.stack([np.interp(grid, time, c) for c in model[rows].T], 1)
-        twice = np.cumsum(np.cumsum(acceleration, axis=0), axis=0) * step**2  # filtered alike
+        twice = np.cumsum(np.cumsum(acceleration, axis=0), axis=0) * step**2  # the same filter for both
         both = [savgol_filter(v, WINDOW, 3, deriv=2, delta=step, axis=0) for v in (place, twice)]
         turn = Rotation.from_quat(np.stack([np.interp(grid, time, c) for c in state[:, 6:10].T], 1)).inv()
         rest.append(turn.apply(both[0] - both[1])[WINDOW:-WINDOW])
@@ -195,7 +195,7 @@ def forces(path: Path, vehicle: str, withhold: Sequence[str], *, learned: bool =
 
 
 def judged(folder: Path, vehicle: str, withhold: Sequence[str] = ()) -> dict[str, Any]:
-    """Pooled over the flights of types that were not fitted, and each of them."""
+    """Scores of the flights of types that were not fitted: pooled, and of each flight."""
     paths = [folder / f"{n}.csv.gz" for n in LEFT_OUT]
     parts = [forces(p, vehicle, withhold) for p in paths]
     learned = [forces(p, vehicle, withhold, learned=True) for p in paths]
@@ -206,7 +206,7 @@ def judged(folder: Path, vehicle: str, withhold: Sequence[str] = ()) -> dict[str
 
 
 def _scores(parts: Sequence[Judged], learned: Sequence[Judged]) -> dict[str, Any]:
-    """By the model alone, and as `predict` has it."""
+    """Scores of the model alone, and of `predict`."""
     return {
         "force_rms": rms_of(np.concatenate([p[0] for p in parts])),
         "predicted_force_rms": rms_of(np.concatenate([p[0] for p in learned])),
@@ -262,9 +262,9 @@ def _with(text: str, *, name: str, mass: float) -> str:
 
 
 def crazypad(shared: Path, work: Path) -> dict[str, Any]:
-    """As a user would: a preset and the healthy flights of a drone make its file, and other flights are judged by it.
+    """Make a drone's file from a preset and healthy flights, and diagnose other flights with this file.
 
-    Each healthy flight is judged by the others of its drone, for the rate of false alarms.
+    Each healthy flight is diagnosed with a file from the others of its drone, for the rate of false alarms.
     """
     folder = shared / "recordings/crazypad"
     result: dict[str, Any] = {}
@@ -286,7 +286,7 @@ def crazypad(shared: Path, work: Path) -> dict[str, Any]:
 
 
 def sysid(shared: Path, work: Path) -> dict[str, Any]:
-    """What is off in the published constants."""
+    """Diagnose errors of the published constants."""
     folder = shared / "recordings/sysid"
     published = Path(__file__).parent / "vehicles/cf2-eschmann.toml"
     return diagnose(work, "sysid", [folder / "log10"], [folder / "log15"], str(published))
@@ -301,7 +301,7 @@ PARTS: dict[str, Callable[[Path, Path], dict[str, Any]]] = {
 
 
 def tables(done: dict[str, Any]) -> str:
-    """Markdown of the figures that were measured; every diagnosis in words is in the JSON file."""
+    """Markdown of the measured figures; the JSON file has every diagnosis in words."""
     out: list[str] = []
     if "nanodrone" in done:
         out += ["| nanodrone, run 4, sum over 50 steps | position m | velocity m/s | rotation rad | rate rad/s |",
@@ -330,14 +330,14 @@ def tables(done: dict[str, Any]) -> str:
 
 
 def public(value: Any) -> Any:
-    """Without the places of this machine's files."""
+    """The value without paths of this machine."""
     if isinstance(value, dict):
         return {k: public(v) for k, v in value.items() if k != "fitted"}
     return [public(v) for v in value] if isinstance(value, list) else value
 
 
 def _delays(delays: dict[str, dict[str, float] | None], begin: str) -> str:
-    """Of all runs whose names begin so."""
+    """Delays of all runs whose names start with `begin`."""
     told = [entry for name, entry in sorted(delays.items()) if name.startswith(begin)]
     return ", ".join(f"{entry['delay_ms']:+.1f} ± {entry['sd_ms']:.1f}" if entry else "not told" for entry in told)
 

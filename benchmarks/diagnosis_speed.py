@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads of the peer only wait for each other
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: more threads make the peer slower
 
 import numpy as np
 import peer_numpy
@@ -29,12 +29,12 @@ from crazyem.recordings.airborne import airtime
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.vehicle import load_vehicle
 
-PAUSE = 0.2  # s between repetitions: a new stretch for the filter
+PAUSE = 0.2  # s between repetitions, so that the filter starts a new stretch
 PEER_SAMPLES = 800
 
 
 def repeated(recording: Recording, seconds: float) -> Recording:
-    """The flight over and over, `seconds` of it in the air."""
+    """The flight repeated, with `seconds` in the air."""
     air = airtime(recording)
     assert air is not None
     begin, end = air.flown[0]
@@ -54,7 +54,7 @@ def repeated(recording: Recording, seconds: float) -> Recording:
 
 
 def peer_seconds(samples: int) -> float:
-    """One pass of filter and smoother in plain numpy over so many samples, from the best of three over a window."""
+    """Seconds of one pass of filter and smoother in plain numpy, scaled from the best of three over a window."""
     em = settled(seed=1, window=PEER_SAMPLES, seconds=12.0)
     last = em.tape.size
     window = window_of(em, last - PEER_SAMPLES, last)
@@ -80,7 +80,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     recording, vehicle = open_recording(arguments.recording), load_vehicle(arguments.vehicle)
-    diagnose([repeated(recording, 10.0)], vehicle, jobs=arguments.jobs)  # compiled
+    diagnose([repeated(recording, 10.0)], vehicle, jobs=arguments.jobs)  # compiles
     rows = []
     for seconds in map(float, arguments.seconds.split(",")):
         long = repeated(recording, seconds)

@@ -34,7 +34,7 @@ PUBLISHED = {"nanodrone": load_vehicle("cf21bl-busetto"), "nanobench": replace(l
 
 
 def fitted(results: Path, drone: str) -> Vehicle:
-    """As the diagnosis of real recordings has it."""
+    """The vehicle that the diagnosis of real recordings has fitted."""
     effects = json.loads(results.read_text())[drone]["effects"]
     values = {e["name"]: {n: p["value"] for n, p in e["parameters"].items()} for e in effects}
     known = [(f"{e['name']}.{n}", p["value"], p["sd"]) for e in effects for n, p in e["parameters"].items() if p["sd"]]
@@ -44,12 +44,12 @@ def fitted(results: Path, drone: str) -> Vehicle:
 
 
 def randomised(vehicle: Vehicle, seed: int, *, each_rotor: bool = False) -> list[Vehicle]:
-    """Mass, each moment of inertia and thrust (of all rotors, or of each) within 20 % of what they are."""
+    """Vehicles whose mass, moments of inertia and thrust (of all rotors, or of each) vary by up to 20 %."""
     rng, found = np.random.default_rng(seed), []
     for _ in range(RANDOM_COUNT):
         mass, *inertia = rng.uniform(1.0 - RANDOM, 1.0 + RANDOM, 4)
         thrust = rng.uniform(1.0 - RANDOM, 1.0 + RANDOM, 4 if each_rotor else 1) * np.ones(4)
-        # rotors of unequal strength turn the drone with their mean thrust: a trim
+        # rotors of unequal thrust make a torque: a trim
         total, *torque = wrench(thrust[None] / 4.0, arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust)[0]
         effects = {n: dict(v) for n, v in vehicle.effects.items()}
         if "inertia" in effects:
@@ -62,7 +62,7 @@ def randomised(vehicle: Vehicle, seed: int, *, each_rotor: bool = False) -> list
 
 
 def flights(shared: Path, drone: str) -> tuple[list[Path], list[Path]]:
-    """Those that were fitted, and those that are judged."""
+    """The fitted and the judged flights."""
     folder = shared / "recordings" / drone
     if drone == "nanobench":
         return [folder / f"{n}.csv.gz" for n in TRAIN], [folder / f"{n}.csv.gz" for n in LEFT_OUT]
@@ -71,7 +71,7 @@ def flights(shared: Path, drone: str) -> tuple[list[Path], list[Path]]:
 
 
 def bands(shared: Path, results: Path, drone: str, count: int, only: str, cache: dict[str, dict]) -> None:
-    """Held shares and widths of every judged flight, into `cache` by its name."""
+    """Put held shares and widths of every judged flight into `cache`, by its name."""
     train, judged = flights(shared, drone)
     vehicle, published = fitted(results, drone), PUBLISHED[drone]
     others = [open_recording(p) for p in train]
@@ -118,9 +118,9 @@ def pooled(cache: dict[str, dict], drone: str) -> str:
 
 
 def file_errors(shared: Path, results: Path, drone: str, path: str, name: str) -> str:
-    """Fields of a published file that were fitted, and errors after half a second on the judged flights: as it is, with
-    the numbers of the fit, and of all that was fitted; position and velocity also along the recorded attitude, where
-    forces alone are judged. What was not fitted is as the drone's preset has it."""
+    """Fields of a published file that were fitted, and errors after half a second on the judged flights: of the file as
+    published, with the fitted values, and of the whole fit. Position and velocity also with the recorded attitude, for
+    the forces alone. Values that were not fitted are the preset's."""
     _, judged = flights(shared, drone)
     source = load_source(path, name=name or None, base=PUBLISHED[drone], strict=False)
     assert source.imported is not None

@@ -27,15 +27,15 @@ from pathlib import Path
 from typing import Any
 
 LIMIT = 120.0  # s of wall time for one flight
-START = 180.0  # s more for the first of a process, which may compile
-OF_A_PROCESS = 40  # flights, then a fresh one
+START = 180.0  # s more for the first flight of a process, which may compile
+OF_A_PROCESS = 40  # flights of a process; then a new one starts
 ARMS = ("none", "guarded", "unguarded")
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "results"
 MARKS = ("<!-- faults: table -->", "<!-- /faults -->")
 
 
 class Pilot:
-    """A process that flies what it is told to, one flight after the other."""
+    """A process that flies the requested flights one after the other."""
 
     def __init__(self, folder: Path, speed: float) -> None:
         command = [sys.executable, "-m", "benchmarks.fault_campaign", "pilot", "--out", str(folder)]
@@ -58,7 +58,7 @@ class Pilot:
         self._lines.put("")
 
     def fly(self, seed: int, arm: str) -> dict[str, Any]:
-        """The result of one flight, or what became of the process; not `usable` any more in that case."""
+        """The result of one flight, or the failure of the process, which is then not `usable`."""
         begun, failed = time.monotonic(), {"seed": seed, "arm": arm, "kinds": []}
         limit = LIMIT if self.flown else LIMIT + START
         self.flown += 1
@@ -76,18 +76,18 @@ class Pilot:
 
     @property
     def usable(self) -> bool:
-        """Whether it can fly another one."""
+        """Whether the process can fly another flight."""
         return self._child.poll() is None and self.flown < OF_A_PROCESS
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         if self._child.poll() is None:
             os.killpg(self._child.pid, signal.SIGKILL)
         self._child.wait()
 
 
 def run(folder: Path, *, flights: int, first: int, arms: Sequence[str], speed: float, minutes: float) -> int:
-    """Fly what is missing; returns how many flights that were."""
+    """Fly the missing flights; returns their number."""
     folder.mkdir(parents=True, exist_ok=True)
     until, done, pilot = time.monotonic() + 60.0 * minutes, 0, None
     try:
@@ -113,7 +113,7 @@ def run(folder: Path, *, flights: int, first: int, arms: Sequence[str], speed: f
 
 
 def _wanted(folder: Path, seeds: Sequence[int], arms: Sequence[str]) -> Iterator[tuple[int, str]]:
-    """What was not flown yet; after a crash with writes the same flight without."""
+    """Missing flights; for each crash with writes also the same flight without."""
     for seed in seeds:
         for arm in sorted(arms, key=ARMS.index):
             place = folder / f"{seed}_{arm}.json"
@@ -125,7 +125,7 @@ def _wanted(folder: Path, seeds: Sequence[int], arms: Sequence[str]) -> Iterator
 
 
 def pilot(folder: Path, speed: float) -> int:
-    """In the child: fly what comes in on standard input, a line of JSON for each."""
+    """In the child: fly the flights read from standard input; prints a line of JSON for each."""
     from benchmarks.fault_flight import fly
 
     out = sys.stdout
@@ -134,7 +134,7 @@ def pilot(folder: Path, speed: float) -> int:
             seed, arm = line.split()
             try:
                 result = dataclasses.asdict(fly(int(seed), arm, folder, speed=speed))
-            except Exception as error:  # the campaign goes on, and names it
+            except Exception as error:  # the campaign goes on and reports the error
                 result = {"seed": int(seed), "arm": arm, "kinds": [], "fault_of_ours": repr(error)}
             cleaned = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in result.items()}
             print(json.dumps(cleaned), file=out, flush=True)

@@ -1,9 +1,8 @@
-"""One flight of the fault campaign: drawn from a seed, harmed on the link, in the host and in the battery, and judged.
+"""One flight of the fault campaign: drawn from a seed, with faults of link, host, payload and battery, and judged.
 
-The drone's own sensors stay sound: what is wrong with the numbers happens between link and session, so that a crash
-comes from what was written, from the link or from the payload, never from a blind autopilot. The verdict is the
-simulator's truth. Simulator and relay are threads of this process, so that a flight costs little more than itself; the
-packets between them are real ones, on real sockets.
+Faults of sensors act between link and session, and the drone's own sensors stay right: so a crash is caused by a write,
+the link or the payload, never by a blind autopilot. The simulator's truth decides. Simulator and relay are threads of
+this process, which saves time; they exchange real packets on real sockets.
 """
 
 import contextlib
@@ -40,13 +39,13 @@ from firmware_sim.relay.relay import Relay
 
 DURATION, BASELINE = 7.0, 1.5  # s of the trajectory, and of the hover before it
 RAW_EVERY = 0.1  # s between writes without a guard
-# A crash: tilt, m/s into the floor (more than a landing that drops the last 0.3 m, as it may), m from the start, m of
-# ceiling above the floor of a usual room, and s that the drone may touch the floor before it is told to land
+# Limits of a crash: tilt; m/s into the floor (a landing may drop the last 0.3 m); m from the start; m, ceiling of a
+# usual room; s for which the drone may touch the floor before the landing
 STEEP, HARD, FAR, CEILING, TOUCH = math.radians(75.0), 2.7, 8.0, 2.5, 0.1
-LATE = 0.25  # s by which the estimator may be behind before the drone's time waits
+LATE = 0.25  # s, largest delay of the estimator before the drone's time waits
 MOTORS = tuple(f"motor.m{i}" for i in range(1, 5))
 
-# What may be wrong with a log variable on its way to the estimator: variables, and value -> value with a number drawn
+# Faults of log variables on the way to the estimator: variables, and range of the drawn number
 SENSORS: dict[str, tuple[tuple[str, ...], tuple[float, float]]] = {
     "stuck_height": (("stateEstimateZ.z",), (0.0, 0.0)),
     "stuck_rates": (("stateEstimateZ.rateRoll", "stateEstimateZ.ratePitch"), (0.0, 0.0)),
@@ -62,7 +61,7 @@ SENSORS: dict[str, tuple[tuple[str, ...], tuple[float, float]]] = {
 
 @dataclass(frozen=True)
 class Case:
-    """What one seed draws. Times are s of firmware time: of `link` since the link was there, of `payload` since
+    """The case drawn by one seed. Times are s of firmware time: of `link` since the connection, of `payload` since
     take-off, all others since pushing began."""
 
     seed: int
@@ -75,11 +74,11 @@ class Case:
     stall_at: float = math.inf
     stall_for: float = 0.0
     link: tuple[dict[str, Any], ...] = ()
-    payload: tuple[tuple[float, float], ...] = ()  # when, kg: attached, or released where negative
+    payload: tuple[tuple[float, float], ...] = ()  # s, kg: attached, or released if negative
 
     @property
     def kinds(self) -> list[str]:
-        """Names of what goes wrong."""
+        """Names of the faults."""
         names = [f"link {f['what']}" for f in self.link] + ([self.sensor] if self.sensor else [])
         names += [f"payload {'attached' if mass > 0 else 'dropped'}" for _, mass in self.payload]
         return names + (["battery"] if self.charge < 1 else []) + (["stall"] if self.stall_for else [])
@@ -101,16 +100,16 @@ class Case:
         return text
 
     def mass_at_end(self) -> float:
-        """kg, once all payloads have come and gone."""
+        """Mass [kg] after all payload events."""
         return self.mass + sum(mass for _, mass in self.payload)
 
 
 def draw(seed: int) -> Case:
-    """The case of a seed: a drone that differs from its vehicle file, and one to three things that go wrong."""
+    """The case of a seed: a drone that differs from its vehicle file, and one to three faults."""
     r = random.Random(f"faults {seed}")
     grown = r.uniform(0.95, 1.35)
     xx, yy, zz = (j * grown * r.uniform(0.9, 1.2) for j in (1.66e-5, 1.67e-5, 2.93e-5))
-    case = Case(seed, 0.029 * grown, (xx, yy, min(zz, 0.98 * (xx + yy))))  # no body has more than the sum
+    case = Case(seed, 0.029 * grown, (xx, yy, min(zz, 0.98 * (xx + yy))))  # triangle inequality of a body
     kinds = ("link", "link", "sensor", "sensor", "payload", "battery", "stall")
     for what in r.sample(kinds, r.choice((1, 1, 2, 3))):
         if what == "link":
@@ -153,7 +152,7 @@ def _draw_link(r: random.Random) -> dict[str, Any]:
 
 
 class Bad:
-    """The link's packets with one sensor gone wrong."""
+    """The link's packets with one faulty sensor."""
 
     def __init__(self, link: Any, case: Case) -> None:
         self._link, self._case = link, case
@@ -193,20 +192,20 @@ class Bad:
 
 
 def pushing_from(session: Session) -> float:
-    """s on the drone's clock when pushing began or will, after the hover at the trajectory's start; NaN before."""
+    """Start of pushing [s, drone's clock], after the hover at the trajectory's start; NaN if unknown."""
     marks = session.history.marks
     return marks.get("push_enabled", marks.get("trajectory_start", math.nan) + BASELINE)
 
 
 class Stalling:
-    """The estimator, which hangs once for a while."""
+    """An estimator that hangs once for a while."""
 
     def __init__(self, vehicle: Vehicle, case: Case) -> None:
         self._inner, self._case = StepAwareEstimator(OnlineEstimator(vehicle)), case
         self.session: Session | None = None
         self.speed = 1.0
         self.newest = math.nan  # s, of the newest sample taken
-        self._harmed = False  # by a stall that it has not caught up with
+        self._harmed = False  # still late after a drawn stall
         self.over = threading.Event()
 
     def __getattr__(self, name: str) -> Any:
@@ -221,17 +220,17 @@ class Stalling:
         return self._inner.feed(sample)
 
     def late(self) -> bool:
-        """Whether it is behind because this machine is slow, not because of a stall that was drawn."""
+        """Whether it is late because this machine is slow, and not because of a drawn stall."""
         session = self.session
         if session is None or session.pipeline.estimate_until < math.inf:
-            return False  # nothing is estimated any more
+            return False  # the estimate has ended
         behind = session.clock.newest - self.newest
         self._harmed = self._harmed and not behind < LATE
         return behind > LATE and not self._harmed
 
 
 class NoGuard:
-    """Writes whatever the estimator says as soon as it says it: what a script of twenty lines does."""
+    """Writes every estimate at once, like a simple script."""
 
     def __init__(self, originals: dict[str, float]) -> None:
         self.controller, self.originals, self.stopped = LEE, originals, ""
@@ -240,7 +239,7 @@ class NoGuard:
         self._last = -math.inf
 
     def stop(self, reason: str) -> None:
-        """An echo that did not come does not stop it."""
+        """Do nothing: a missing echo does not stop the writes."""
 
     def consider(self, estimate: Estimate, time: float, *, airborne: bool, enabled: bool = True) -> Decision:
         if not airborne or time - self._last < RAW_EVERY:
@@ -255,7 +254,7 @@ class NoGuard:
 
 
 class Listening(Engine):
-    """A relay's engine that keeps every parameter write that passed upwards: what really left for the drone."""
+    """A relay's engine that keeps every parameter write on the way to the drone."""
 
     def __init__(self, seed: int) -> None:
         super().__init__((), seed)
@@ -269,7 +268,7 @@ class Listening(Engine):
 
 @dataclass
 class Result:
-    """What became of a flight; `error` is the sentence it ended with."""
+    """Result of a flight; `error` is its last sentence in case of an error."""
 
     seed: int
     arm: str
@@ -278,19 +277,19 @@ class Result:
     error: str = ""
     fault_of_ours: str = ""
     writes: int = 0
-    left: int = 0  # different ones that were seen leaving for the drone
+    left: int = 0  # number of different writes on the way to the drone
     unrecorded: int = 0
     purposes: dict[str, int] = field(default_factory=dict)
     stopped: str = ""
     mass_error: float = math.nan
-    landing: float = math.nan  # s of firmware time when it was told to land; NaN: never
-    steps: int = 0  # changes of mass that the estimator was sure of
+    landing: float = math.nan  # s of firmware time at the start of the landing; NaN: never
+    steps: int = 0  # changes of mass that the estimator has confirmed
     seconds: float = 0.0
     processor_s: float = 0.0
 
 
 def fly(seed: int, arm: str, folder: Path, *, speed: float) -> Result:
-    """Draw, fly, judge. Files of the flight go to `folder`."""
+    """Draw, fly and judge a case. Files of the flight go to `folder`."""
     case, begun, spent = draw(seed), time.monotonic(), time.process_time()
     result = Result(seed, arm, case.kinds)
     scenario, truth, file = (folder / f"{seed}_{arm}.{end}" for end in ("toml", "csv", "mcap"))
@@ -308,7 +307,7 @@ def fly(seed: int, arm: str, folder: Path, *, speed: float) -> Result:
         stack.callback(link.close)
         link.connect(60.0)
         engine.began = None
-        engine.replace(faults)  # their times count from here: connecting under faults is tested elsewhere
+        engine.replace(faults)  # their times start here: connecting under faults is tested elsewhere
         names = _names(link)
         _fly(case, arm, link, vehicle, file, result, pace)
     result.crashed = crash(truth, landing=result.landing)
@@ -317,12 +316,12 @@ def fly(seed: int, arm: str, folder: Path, *, speed: float) -> Result:
     result.seconds, result.processor_s = time.monotonic() - begun, time.process_time() - spent
     for path in (scenario, truth, file):
         if not result.crashed and not result.fault_of_ours and not result.unrecorded:
-            path.unlink(missing_ok=True)  # kept only where there is something to look at
+            path.unlink(missing_ok=True)  # kept for flights with findings only
     return result
 
 
 def _fault(drawn: dict[str, Any], speed: float) -> Fault:
-    """For the relay, whose times are the host's."""
+    """A fault for the relay, whose times are the host's."""
     hosts = {k: drawn[k] / speed for k in ("start", "end", "ms", "jitter_ms") if k in drawn}
     return Fault(**{**drawn, **hosts, "kinds": frozenset(drawn.get("kinds", ()))})
 
@@ -334,7 +333,7 @@ def _fly(case: Case, arm: str, link: Any, vehicle: Vehicle, file: Path, result: 
     assert recorder is not None
     session = Session(bad, vehicle=vehicle, estimator=estimator, recorder=recorder)
     bad.session = estimator.session = session
-    rules = WriteRules(dry_run=arm == "unguarded")  # the raw writer takes the guard's place below
+    rules = WriteRules(dry_run=arm == "unguarded")  # the raw writer below replaces the guard
     plan = FlightPlan(trajectory_maker(["excite"], DURATION), LEE, push=arm != "none", rules=rules, baseline=BASELINE)
     flight = Flight(session, plan)
     if arm == "unguarded":
@@ -359,7 +358,7 @@ def _fly(case: Case, arm: str, link: Any, vehicle: Vehicle, file: Path, result: 
     result.stopped = str(history.guard.get("stopped", "")) if arm == "guarded" else ""
     if history.pushes and (masses := [p.value for p in history.pushes if p.parameter == LEE.mass]):
         result.mass_error = masses[-1] / case.mass_at_end() - 1.0
-    result.landing = history.marks.get("estimate_end", math.nan)  # drawn when a landing begins
+    result.landing = history.marks.get("estimate_end", math.nan)  # set when a landing begins
     result.steps = sum(step.real is True for step in history.steps)
 
 
@@ -382,10 +381,10 @@ def _names(link: Any) -> dict[int, str]:
 
 
 def unrecorded(sent: set[bytes], names: dict[int, str], file: Path) -> int:
-    """How many different writes to the controller left for the drone and are not in the recording."""
+    """Number of different writes to the controller that were sent and are not in the recording."""
     try:
         events = open_recording(file).events
-    except CrazyemError:  # ended before anything was recorded: whatever left is then missing
+    except CrazyemError:  # ended without a recording: every write is missing
         events = ()
     kept = {
         (str(e.data.get("name")), struct.pack("<f", float(e.data.get("value", math.nan))))
@@ -397,7 +396,7 @@ def unrecorded(sent: set[bytes], names: dict[int, str], file: Path) -> int:
 
 
 def crash(truth: Path, *, landing: float = math.nan) -> str:
-    """How it crashed, "" if it did not, by the simulator's truth; `landing`: s when it was told to land."""
+    """Kind of crash by the simulator's truth, "" for none; `landing`: start of the landing [s]."""
     flown, down = False, math.nan
     try:
         with truth.open(newline="", encoding="utf-8") as file:
@@ -420,5 +419,5 @@ def crash(truth: Path, *, landing: float = math.nan) -> str:
                 if math.hypot(x, y) > FAR:
                     return f"flew away at {t:.2f} s"
     except (OSError, TypeError, ValueError):
-        return ""  # the simulator was ended within a line
+        return ""  # the last line is incomplete
     return ""

@@ -27,10 +27,10 @@ MIXER = np.array([[1.0, 1.0, 1.0, 1.0], [-1.0, -1.0, 1.0, 1.0], [-1.0, 1.0, 1.0,
 
 @dataclass(frozen=True)
 class Flight:
-    """What was logged, and the truth behind it.
+    """The log of a flight and its truth.
 
     Attributes:
-        vehicle: nominal constants, as the estimator is told them.
+        vehicle: nominal constants, given to the estimator.
         time: (n,) s.
         measured: (n, 13) position [m], velocity [m/s] world; quaternion x y z w body to world; body rate [rad/s] FLU.
         command: (n, 4) duty of the rotors in force at the stamp, 0..1.
@@ -184,7 +184,7 @@ def simulate(
         disturbance: intensity of force [N sqrt(s)] and torque [N m sqrt(s)] noise.
 
     Raises:
-        RuntimeError: the rotors' limits or the controller were left behind, and the flight is not one to learn from.
+        RuntimeError: the drone left the range of its rotors or controller, and the flight is useless.
     """
     vehicle = load_vehicle("cf2")
     rng = np.random.default_rng(seed)

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1] / "tests" / "crazyem"
-COMPILED = "crazyem.recordings.mcap.kernel"  # numba compiles what it finds, which must not be instrumented
+COMPILED = "crazyem.recordings.mcap.kernel"  # compiled by numba, so it must not be instrumented
 SECONDS = 10
 
 
@@ -84,7 +84,7 @@ def main() -> None:
         given = [word for word in sys.argv[1:] if not word.startswith("-")]
         options = [f"-timeout={SECONDS}", f"-max_len={2 * len(made[name]) + 64}", *sys.argv[1:]]
         attempt = target(Path(folder) / "input.bin")
-        attempt(made[name])  # what is loaded at first use is no fault of an input
+        attempt(made[name])  # load everything first, so that loading does not count for an input
         atheris.Setup([sys.argv[0], *options, *([] if given else [str(corpus)])], attempt)
         atheris.Fuzz()
 

@@ -63,7 +63,7 @@ def fly(*, duration: float, trajectory: str, seed: int) -> dict[str, Any]:
         if process.returncode != 0:
             raise SystemExit(f"crazyem fly failed: {lines[-1][1] if lines else process.returncode}")
         told = json.loads(summary.read_text())
-    # the last marks belong to the landing, the final estimate and the plot
+    # later marks belong to landing, final estimate and plot
     inside = [m for m in marks if m[0] - marks[0][0] <= duration]
     (begin, before), (end, after) = inside[0], inside[-1]
     seconds = end - begin

@@ -13,19 +13,19 @@ from firmware_sim.flight import Flight as SimulatedFlight
 from firmware_sim.scenario import load_scenario
 from firmware_sim.server import Server, bind
 
-# For what writes without a guard: every write passes (see crazyem.live.write_gate).
+# A gate for writes without a guard: every write passes (see crazyem.live.write_gate).
 OPEN_GATE: Any = SimpleNamespace(stale=lambda: "", misplaced=lambda purpose: "")
 
 
 class Pace:
-    """Makes the drone's time wait for an estimator that a slow machine holds up: that is no fault that was drawn."""
+    """Makes the drone's time wait for an estimator that is late on a slow machine, because this is no drawn fault."""
 
     def __init__(self, speed: float) -> None:
         self.speed = speed  # firmware seconds per second
         self.late: Callable[[], bool] | None = None  # whether the drone has to wait
 
     def wait(self) -> None:
-        """At most as long as the simulator's own time stands still for a host that is late."""
+        """Wait while the estimator is late, at most 0.2 s: less than the delay that the simulator catches up."""
         until = time.monotonic() + 0.2
         while (late := self.late) is not None and late() and time.monotonic() < until:
             time.sleep(0.003)
@@ -33,7 +33,7 @@ class Pace:
 
 @contextlib.contextmanager
 def in_a_thread(server: Any) -> Iterator[None]:
-    """Runs a relay or a simulated drone beside this thread."""
+    """Run a relay or a simulated drone in another thread."""
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
     try:

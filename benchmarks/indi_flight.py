@@ -1,7 +1,7 @@
 """Flights of the simulated firmware in one process, with guard, write supervisor and monitor.
 
 Bytes in, log packets out (wire_flight.py); estimator, guard, monitor and gate are those of `crazyem fly`, without its
-threads: what the guard decides is in the drone 20 ms later. The truth is used for drawing and judging only.
+threads: a decision of the guard is in the drone 20 ms later. The truth is used for drawing and judging only.
 """
 
 import math
@@ -40,14 +40,14 @@ TAKE_OFF, BASELINE = 2500, 2.0  # ms, s
 
 @dataclass
 class Writer:
-    """What the write supervisor asks of a pusher; writes at once."""
+    """The part of a pusher that the write supervisor uses; writes at once."""
 
     flight: "GuardedFlight"
     known: dict[str, float]
     busy: bool = False
 
     def submit(self, decision: Decision) -> None:
-        """Write a set, or what differs of the values to go back to."""
+        """Write a set of values, or restore those values that differ."""
         writes = decision.writes
         if decision.kind != "push":
             self.flight.reverted = True
@@ -62,12 +62,12 @@ class Writer:
 
 @dataclass
 class GuardedFlight:
-    """A flight that goes on in `fly`, with what was seen of it.
+    """A flight made by `fly`, with its records.
 
     Args:
         controller: stabilizer.controller. parameters: at boot, beside the scenario's.
-        tamper: what becomes of an estimate before it reaches the guard, or None.
-        estimator: None: one that looks for no steps of mass.
+        tamper: changes an estimate before it reaches the guard, or None.
+        estimator: None: one without detection of mass steps.
     """
 
     scenario: Scenario
@@ -126,12 +126,12 @@ class GuardedFlight:
             self.pipeline.push = self.writer.submit
 
     def consider(self, estimate: Estimate, time: float, *, airborne: bool, enabled: bool = True) -> Decision:
-        """The supervisor's answer to a tampered estimate."""
+        """The supervisor's decision on the estimate after `tamper`."""
         assert self.tamper is not None
         return self.supervisor.consider(self.tamper(estimate), time, airborne=airborne, enabled=enabled)
 
     def on_mass_step(self, *_: object) -> None:
-        """No payload comes or goes here."""
+        """Do nothing: there are no payload events here."""
 
     def read(self, name: str) -> float:
         """A parameter."""
@@ -139,12 +139,12 @@ class GuardedFlight:
 
     @property
     def seconds(self) -> float:
-        """Since the trajectory began, after its hover."""
+        """Time since the start of the trajectory, after the hover [s]."""
         return self.flight.tick / 1000.0 - self.begin - BASELINE
 
     @property
     def crashed(self) -> bool:
-        """On its back, locked, or far below: it does not fly any more."""
+        """Whether the drone has crashed: on its back, locked, or far below."""
         s = self.flight.state
         upright = 1.0 - 2.0 * (s[at.QUAT + 1] ** 2 + s[at.QUAT + 2] ** 2)
         return bool(upright < 0.0 or (not math.isnan(self.begin) and s[at.POS + 2] < 0.2))
@@ -158,7 +158,7 @@ class GuardedFlight:
     ) -> None:
         """Take off to 1 m, hover for 2 s, fly; `each` is called with every setpoint. Ends early with a crash.
 
-        push_for: s of the trajectory in which the guard writes and judges.
+        push_for: s of the trajectory during which the guard is active.
         """
         c = self.client
         c.send(wire.SUPERVISOR, 1, bytes((1, 1)))
@@ -190,7 +190,7 @@ class GuardedFlight:
                 return
 
     def _wait(self, milliseconds: int) -> None:
-        """Let time pass; what is logged meanwhile goes through telemetry, monitor and estimator."""
+        """Let time pass; the log packets go through telemetry, monitor and estimator."""
         self.client.wait(milliseconds)
         packets, self.client.packets = self.client.packets, []
         for data in packets:
@@ -212,7 +212,7 @@ _NUMPY = {1: "<u1", 2: "<u2", 3: "<u4", 4: "<i1", 5: "<i2", 6: "<i4", 7: "<f4", 
 
 
 def scaled(estimate: Estimate, names: tuple[str, ...], factor: float, *, sd: float = 0.01) -> Estimate:
-    """An estimate that says `factor` times the value of some parameters, and is sure of it."""
+    """An estimate with `factor` times the value of some parameters, and with small intervals."""
     changed = dict(estimate.parameters)
     for name in names:
         p = changed[name]

@@ -30,7 +30,7 @@ from firmware_sim.scenario import Scenario, parse_scenario
 
 NAMES = ("mass", "Ixx", "Iyy", "Izz")
 FILE_LAG = 0.05  # s, in the vehicle file
-LAGS = (0.03, 0.07)  # s, of what flies
+LAGS = (0.03, 0.07)  # s, range of the true lag
 DURATION = 20.0  # s of trajectory
 SETTLING = 1.0  # s of trajectory before the first line
 
@@ -66,19 +66,19 @@ class Case:
         return f"{self.vehicle}-{self.kind}-{self.noise}-{self.seed}.npz"
 
     def scenario(self) -> Scenario:
-        """What is true."""
+        """The scenario with the true values."""
         platform, mass, inertia = VEHICLES[self.vehicle]
         body = {"mass": mass, "inertia": list(inertia), "motor_time_constant": self.lag}
         return parse_scenario({"platform": platform, "vehicle": body, **NOISES[self.noise]}, "interval study")
 
     def trajectory(self) -> Trajectory:
-        """What is flown."""
+        """The trajectory of the flight."""
         make = {"hover": hover, "figure8": figure8, "excite": excite}[self.kind]
         return make(position=(0.0, 0.0, 1.0), duration=DURATION)
 
 
 def draw(flights: int, seed: int) -> list[Case]:
-    """Cases in turn over vehicles, trajectories and noises, lags drawn evenly."""
+    """Cases that alternate over vehicles, trajectories and noises, with lags drawn uniformly."""
     cells = [(v, k, n) for v in VEHICLES for k in KINDS for n in NOISES]
     rng = np.random.default_rng(seed)
     lags = rng.uniform(*LAGS, flights)
@@ -86,13 +86,13 @@ def draw(flights: int, seed: int) -> list[Case]:
 
 
 def truth(case: Case) -> dict[str, float]:
-    """True values of what is scored."""
+    """True values of the scored parameters."""
     _, mass, inertia = VEHICLES[case.vehicle]
     return dict(zip(NAMES, (mass, *inertia)))
 
 
 def fly_all(cases: Iterable[Case], folder: Path) -> None:
-    """Fly what is missing."""
+    """Fly the missing flights."""
     folder.mkdir(parents=True, exist_ok=True)
     for case in cases:
         if (folder / case.file).exists():
@@ -106,7 +106,7 @@ def fly_all(cases: Iterable[Case], folder: Path) -> None:
 
 
 def lines(case: Case, log: Log, *, every: int = 4) -> list[dict[str, Any]]:
-    """What the estimator says once a second of the trajectory."""
+    """Estimates, one for each second of the trajectory."""
     vehicle = replace(load_vehicle(VEHICLES[case.vehicle][0]), motor_time_constant=FILE_LAG)
     estimator = OnlineEstimator(vehicle, attitude_period=ATTITUDE_PERIOD, prediction_period=PERIOD, every=every)
     said: list[dict[str, Any]] = []
@@ -135,9 +135,9 @@ def lines(case: Case, log: Log, *, every: int = 4) -> list[dict[str, Any]]:
 
 
 def table(said: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Of lines that say "identifiable": share held, mean signed error in sd, its rms; median sd; share identifiable.
+    """Of identifiable estimates: share held, mean signed error in sd, its rms; median sd; share identifiable.
 
-    The standard error of a share is that over flights, whose lines are not independent.
+    The standard error of a share is over flights, because the lines of a flight are dependent.
     """
     good = [s for s in said if s["identifiable"]]
     if not good:
@@ -162,7 +162,7 @@ def table(said: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def report(said: Sequence[Mapping[str, Any]], by: Sequence[str] = ("kind", "noise")) -> dict[str, Any]:
-    """Print and return the tables: each parameter over all, and split."""
+    """Print and return the tables: each parameter over all flights, and by `by`."""
     groups: dict[str, Any] = {}
     for name in NAMES:
         of_name = [s for s in said if s["name"] == name]

@@ -2,7 +2,7 @@
 
 Decision variables are the 12 states at every sample, the six impulses of every step, and the logarithms of mass and the
 three moments of inertia; the cost is the negative log-posterior of measurements and impulses with the noise scales
-given. That is the joint mode of states and parameters over one window, which an EM pass replaces by expectations.
+given. The solution is the joint mode of states and parameters over one window; EM uses expectations of states instead.
 Multiple shooting, exact Hessians, same midpoint rule as the estimator, roll-pitch-yaw for the attitude.
 """
 

@@ -32,14 +32,14 @@ UNDISTURBED_SECONDS, FAULTS_EACH = 60.0, 3  # s of trajectory; faults of a fligh
 FAULTY_SECONDS = 64.0  # s of trajectory
 SPAN = 18  # innovations in a residual: 0.2 s
 CHANNELS = (5, 9, 10, 11)  # vertical velocity, body rates
-WITHIN = 3.0  # s after its onset in which a report is one of this fault
-APART = 10.0  # s, alarms closer together count once
+WITHIN = 3.0  # s after the onset of a fault in which a report counts for this fault
+APART = 10.0  # s; alarms within this time count once
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "results" / "monitor.md"
 MARKS = ("<!-- monitor: table -->", "<!-- /monitor -->")
 
 
 def fly(seed: int, faults: int, kinds: Sequence[str] = tuple(FAULTS)) -> dict[str, Any]:
-    """One flight: what happened, what was reported, and the residuals."""
+    """One flight: its faults, reports and residuals."""
     seconds = FAULTY_SECONDS if faults else UNDISTURBED_SECONDS
     world = draw(seed, kinds=kinds, faults=faults)
     vehicle, _ = folding.fold(world.vehicle)
@@ -84,7 +84,7 @@ def fly(seed: int, faults: int, kinds: Sequence[str] = tuple(FAULTS)) -> dict[st
 def run(
     folder: Path, undisturbed: int, faulty: int, first: int, minutes: float, kinds: Sequence[str] = tuple(FAULTS)
 ) -> None:
-    """Fly what is missing."""
+    """Fly the missing flights."""
     folder.mkdir(parents=True, exist_ok=True)
     until = time.monotonic() + 60.0 * minutes
     wanted = [(f"u{s}", s, 0) for s in range(first, first + undisturbed)]
@@ -99,7 +99,7 @@ def run(
 
 
 def alarms(times: Sequence[float], events: Sequence[Any]) -> list[float]:
-    """Those that no fault explains, neither its coming nor its going, each stretch of `APART` once."""
+    """Reports that neither onset nor end of a fault explains, one for each stretch of `APART`."""
     out: list[float] = []
     for t in times:
         explained = any(e[2] - 0.1 <= t < e[2] + (APART if e[0] == "" else 6.0 + APART) for e in events)
@@ -115,7 +115,7 @@ def rate_interval(count: int, hours: float) -> tuple[float, float]:
 
 
 def crossings(flight: dict[str, Any], bands: NDArray[np.float64]) -> list[float]:
-    """Times at which a residual is beyond its band, from the time on at which the monitor tests."""
+    """Times at which a residual exceeds its band, from the start of the monitor's tests on."""
     table = np.array(flight["residuals"])
     table = table[table[:, 0] > flight["end"] - flight["airborne_s"] + 3.0]
     return table[(table[:, 1:] > bands).any(1), 0].tolist()  # type: ignore[no-any-return]

@@ -1,8 +1,8 @@
-"""Flights for the monitor's benchmark: a random world flown in this process, what its log gives, faults on the way.
+"""Flights for the monitor's benchmark: a random world flown in this process, with faults during the flight.
 
-Firmware, controllers and plant are those of `python -m firmware_sim`, the blocks those that a session subscribes to.
-Faults of the body are changes in the plant, faults of sensors happen between link and estimator. A fault comes, and
-goes after a while, so that one flight shows several.
+Firmware, controllers and plant are those of `python -m firmware_sim`; log blocks are those of a session. Faults of the
+body are changes in the plant, faults of sensors act between link and estimator. A fault ends after a while, so that one
+flight has several.
 """
 
 import math
@@ -43,12 +43,12 @@ Sense = Callable[[Sample], Sample]
 
 @dataclass(frozen=True)
 class Event:
-    """A fault that comes or goes.
+    """The onset or end of a fault.
 
     Attributes:
-        kind: as the table names it, "" for the end of one. expected: names of the monitor that are right.
+        kind: name in the table, "" for the end of a fault. expected: right names in the monitor's report.
         time: s of the drone's clock. size: in the table's unit.
-        plant: called once with the simulated flight. sense: every sample until the next event.
+        plant: called once with the simulated flight. sense: applied to every sample until the next event.
         payload: entry of the scenario's payload events.
     """
 
@@ -63,7 +63,7 @@ class Event:
 
 @dataclass(frozen=True)
 class World:
-    """A drawn flight: the case, the vehicle file that the estimator is told, what happens."""
+    """A drawn flight: the case, the vehicle file of the estimator, the events."""
 
     case: dict[str, Any]
     seed: int
@@ -76,7 +76,7 @@ class World:
 def draw(seed: int, *, kinds: Sequence[str] = (), faults: int = 0) -> World:
     """A flight of a random world without hidden effects; hover, figure 8, excite and waypoints in turn.
 
-    `faults` of the `kinds` come and go, drawn at random.
+    `faults`: number of faults, drawn from `kinds`.
     """
     random = np.random.default_rng([seed, 43])
     case = random_case(f"{seed:06d}", "nothing", {}, random)
@@ -107,14 +107,14 @@ def boot(world: World) -> Firmware:
             table["payload"] = {"events": payload}
         scenario = parse_scenario(table, world.case["case"], folder=Path(folder))
     flight = Flight(scenario, world.seed)
-    if world.events:  # the plant heeds effects that are neutral until an event
+    if world.events:  # the plant must compute effects that are neutral until an event
         flight._truth[[at.EFFECT_ROTORS, at.EFFECT_BODY, at.EFFECT_SENSING]] = 1.0
         flight._effects, flight._tick_step = True, tick_step_with_effects
     return Firmware(flight, platform=scenario.platform, seed=world.seed, parameters=scenario.parameters)
 
 
 def samples(world: World, *, duration: float) -> Iterator[Sample]:
-    """What the estimator would be given until the landing begins; ends early when the drone is down or astray."""
+    """Samples for the estimator until the landing begins; ends early when the flight has failed."""
     firmware = boot(world)
     drone, contents = firmware.flight, firmware.log.table
     plan = block_plan(tuple(contents.by_name))
@@ -164,7 +164,7 @@ def samples(world: World, *, duration: float) -> Iterator[Sample]:
                 yield sample if sense is None else sense(sample)
 
 
-# what may happen: (world, random numbers, s when it comes, s when it goes) -> events
+# possible faults: (world, random numbers, s of the onset, s of the end) -> events
 
 
 def _lose(rotor: int, scale: float) -> Callable[[Any], None]:
@@ -210,7 +210,7 @@ def _payload(share: float) -> Any:
         mass = share * world.vehicle.mass
         place = (*random.uniform(-0.005, 0.005, 2).tolist(), -0.01)
         attach = (("action", "attach"), ("time", begin), ("mass", mass), ("position", list(place)))
-        names = ("payload", "payload_off_centre", "thrust_scale")  # of mass and thrust a flight tells only the ratio
+        names = ("payload", "payload_off_centre", "thrust_scale")  # a flight shows only the ratio of mass and thrust
         return [
             Event(f"payload {100 * share:.0f} %", names, begin, mass, payload=attach),
             Event("", (), end, payload=(("action", "release"), ("time", end))),
@@ -220,7 +220,7 @@ def _payload(share: float) -> Any:
 
 
 def _battery(world: World, random: np.random.Generator, begin: float, end: float) -> list[Event]:
-    """All rotors lose 15 % of their thrust, and the voltage that is logged does not say so."""
+    """All rotors lose 15 % of their thrust, and the logged voltage does not show it."""
 
     def scale(by: float) -> Callable[[Any], None]:
         def plant(drone: Any) -> None:
@@ -233,7 +233,7 @@ def _battery(world: World, random: np.random.Generator, begin: float, end: float
 
 
 def _sensed(kind: str, signal: str, expected: tuple[str, ...], change: Callable[[float, int], Any]) -> Any:
-    """`change` (random sign, axis) gives the map from value to value."""
+    """A fault of a sensor; `change` (random sign, axis) gives the map from value to value."""
 
     def make(world: World, random: np.random.Generator, begin: float, end: float) -> list[Event]:
         convert = change(float(random.choice((-1.0, 1.0))), int(random.integers(3)))

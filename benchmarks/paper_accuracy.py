@@ -22,11 +22,11 @@ from accuracy_study import PARTS, Record, missed, study, summary, table
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs" / "results" / "paper_accuracy.md"
 RESULTS = ROOT / "docs" / "results" / "paper_accuracy.json"
-KEPT = 1  # flights of each part whose records stand in the results, for the drift check
+KEPT = 1  # flights of each part whose records are kept in the results, for the drift check
 
 
 def load(path: Path) -> dict[tuple[str, str, int], list[Record]]:
-    """Records of a file of JSON lines by part, sensor and seed; a line broken off at the end is dropped."""
+    """Records of a file of JSON lines by part, sensor and seed; an incomplete last line is dropped."""
     found: dict[tuple[str, str, int], list[Record]] = {}
     for line in path.read_text().splitlines() if path.exists() else []:
         try:
@@ -39,12 +39,12 @@ def load(path: Path) -> dict[tuple[str, str, int], list[Record]]:
 
 
 def record(row: Mapping[str, Any]) -> Record:
-    """A record as JSON gave it back."""
+    """A record from its JSON row."""
     return Record(**{k: tuple(v) if isinstance(v, list) else v for k, v in row.items()})
 
 
 def run(parts: Sequence[str], sensors: str, seeds: range, path: Path, *, limit: float) -> bool:
-    """Fly and estimate what the file does not hold yet, a line per flight; False if `limit` s were not enough."""
+    """Fly and estimate the missing flights, one line for each; False if `limit` s were not enough."""
     done = load(path)
     wanted = [(p, s, k) for k in seeds for p in parts for s in PARTS[p].sensors if s in sensors]
     wanted = [key for key in wanted if key not in done]
@@ -77,7 +77,7 @@ def results(path: Path) -> dict[str, Any]:
 
 
 def blocks(found: Mapping[str, Any]) -> dict[str, str]:
-    """What stands between the markers of the docs, by part: the last sensor whole, and a sentence on each."""
+    """The text between the markers of the docs, by part: the table of the last sensor, and a sentence on each."""
     out = {}
     for part, sensors in found.items():
         seeds = next(iter(sensors.values()))["seeds"]
@@ -97,7 +97,7 @@ def blocks(found: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _narrow(text: str) -> str:
-    """A table without the columns that a page has no room for."""
+    """A table without the columns that are too wide for the page."""
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.split("\n")]
     shown = [i for i, name in enumerate(rows[0]) if name not in ("n", "excess / bound", "claimed / bound")]
     return "\n".join(f"| {' | '.join(row[i] for i in shown)} |" for row in rows)

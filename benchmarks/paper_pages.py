@@ -41,7 +41,7 @@ _BLOCK = re.compile(r"(<!-- paper:([a-z0-9_]+) -->\n)(.*?)(<!-- /paper:\2 -->)",
 
 
 def summarised(results: Record) -> dict[str, Any]:
-    """What is kept of a run for the pages: everything but single flights and figures."""
+    """The part of a run that the pages use: all but single flights and figures."""
     return {k: v for k, v in results.items() if k not in ("tasks", "figures")}
 
 
@@ -56,7 +56,7 @@ def small(results: Record) -> dict[str, Any]:
 
 
 def filled(text: str, results: Record) -> str:
-    """A page with its blocks written anew.
+    """A page with its blocks replaced.
 
     Raises:
         UsageError: the page has a block that is unknown.
@@ -82,10 +82,10 @@ def wrapped(text: str) -> str:
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """results.json, or what is kept of it.
+    """results.json, or its summary.
 
     Raises:
-        FileFormatError: it cannot be read or is something else.
+        FileFormatError: the file cannot be read or has another content.
     """
     try:
         if path.stat().st_size > LARGEST_RESULTS:
@@ -160,7 +160,7 @@ def _environment(results: Record) -> str:
 
 
 def better_grid(results: Record) -> Grid:
-    """The paper, its method here, crazyem and the bound in one table: widths, bias, convergence, coverage."""
+    """Table of the paper, its method here, crazyem and the bound: widths, bias, convergence, coverage."""
     cells = results["cells"]
 
     def chosen(experiment: str, *, mass: bool) -> list[Record]:
@@ -171,7 +171,7 @@ def better_grid(results: Record) -> Grid:
         return None if not value else (value["range"][1] - value["range"][0]) / one["true"]
 
     def widths(some: Sequence[Record], who: str) -> str:
-        """Each sensor; of inertia the geometric mean of its three axes."""
+        """Widths of each sensor; for inertia the geometric mean of its three axes."""
         said = []
         for sensor in "ABC":
             values = [w for c in some if c["sensor"] == sensor and (w := width(c, who))]

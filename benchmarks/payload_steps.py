@@ -43,7 +43,7 @@ from firmware_sim.scenario import parse_scenario
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "results"
 MASS = 0.029  # kg, of the bare drone
 HEIGHT, RISE = 1.0, 2.0  # m, s
-EVENT, AFTER = 10.0, 4.0  # s after boot; s flown after it
+EVENT, AFTER = 10.0, 4.0  # s: the event after boot; flight after the event
 PUSH_FROM = RISE + 1.5  # s
 MARKS = ("<!-- steps: tables -->", "<!-- /steps -->")
 WITHIN = 0.02  # of the mass: the aim, one second after the event
@@ -57,28 +57,28 @@ CALM = ("hover", "figure8", "excite", "gusts 0.5", "gusts 1.0")
 
 @dataclass(frozen=True)
 class Case:
-    """What is flown: `kind` attach or release with a share `size` of the bare mass, or one of CALM."""
+    """A case: `kind` attach or release with a share `size` of the bare mass, or one of CALM."""
 
     kind: str
     size: float = 0.0
 
     @property
     def name(self) -> str:
-        """As in the table."""
+        """Name in the table."""
         return f"{self.kind} {100 * self.size:.0f} %" if self.size else self.kind
 
     @property
     def before(self) -> float:
-        """kg."""
+        """Mass before the event [kg]."""
         return MASS * (1.0 + self.size) if self.kind == "release" else MASS
 
     @property
     def after(self) -> float:
-        """kg."""
+        """Mass after the event [kg]."""
         return MASS * (1.0 + self.size) if self.kind.endswith("attach") else MASS
 
     def scenario(self, r: random.Random) -> dict[str, Any]:
-        """For the simulator; place and instant of the payload are drawn."""
+        """The simulator's scenario; place and time of the payload are drawn."""
         place = (r.uniform(-0.003, 0.003), r.uniform(-0.003, 0.003), r.uniform(-0.025, 0.01))
         when = EVENT + r.uniform(0.0, 0.1)
         table: dict[str, Any] = {"vehicle": {"mass": MASS}}
@@ -94,7 +94,7 @@ class Case:
         return table
 
     def trajectory(self) -> Trajectory:
-        """From the end of the rise on."""
+        """The trajectory after the take-off."""
         make: Any = {"figure8": figure8, "excite": excite}.get(self.kind, hover)
         path = make(position=(0.0, 0.0, HEIGHT), duration=EVENT + AFTER - RISE - 1.0)
         return after_hover(path, seconds=1.0)
@@ -112,7 +112,7 @@ class Drone:
         scenario = parse_scenario(case.scenario(r), case.name)
         self.flight = Flight(scenario, seed)
         self.write("stabilizer.controller", 5.0)
-        self.write("ctrlLee.mass", case.before)  # what was pushed before the payload came or went
+        self.write("ctrlLee.mass", case.before)  # the value pushed before the event
         self.path = case.trajectory()
         self.blocks = [
             Block(n, tuple(Variable(v, _type(v)) for v in names), 10)
@@ -171,7 +171,7 @@ def _type(name: str) -> str:
 
 
 class Now:
-    """The pusher without a thread and without a link: what is decided is written at once."""
+    """A pusher without thread and link, which writes decisions at once."""
 
     def __init__(self, drone: Drone, write_supervisor: WriteSupervisor, history: History) -> None:
         self.drone, self.write_supervisor, self.history = drone, write_supervisor, history
@@ -180,7 +180,7 @@ class Now:
         self.masses: list[tuple[float, float]] = []
 
     def submit(self, decision: Decision) -> None:
-        """Write all of it."""
+        """Write all values of a decision."""
         for name, value in decision.writes:
             self.drone.write(name, value)
             self.known[name] = value
@@ -191,13 +191,13 @@ class Now:
 
 
 def fly(case: Case, seed: int, *, aware: bool = True, push: bool = True) -> dict[str, Any]:
-    """One flight; what the estimator and the controller knew, and when."""
+    """One flight; errors of the mass in estimator and controller over time."""
     drone, vehicle, history = Drone(case, seed), load_vehicle("cf2"), History()
     inner = OnlineEstimator(vehicle)
     estimator: Any = StepAwareEstimator(inner) if aware else inner
     newest, policy = [0.0], load_policy()
     gate = WriteGate(Telemetry(info=FLYING | CAN_FLY, heard=0.0), policy.health, now=lambda: 0.0)
-    gate.telemetry.take(Sample("position", 0.0, (0.0, 0.0, 1.0)))  # this one begins in the air
+    gate.telemetry.take(Sample("position", 0.0, (0.0, 0.0, 1.0)))  # the flight starts in the air
     originals = {p: drone.read(p) for p in LEE.parameters}
     nominal = dict(zip(("mass", "Ixx", "Iyy", "Izz"), (vehicle.mass, *vehicle.inertia)))
     write_supervisor = WriteSupervisor(
@@ -249,7 +249,7 @@ def fly(case: Case, seed: int, *, aware: bool = True, push: bool = True) -> dict
 
 
 def _errors(rows: Sequence[tuple[float, float, Any]], t0: float, mass: float) -> dict[str, Any]:
-    """Error one second after, the largest from then on, when it is small for good, and whether intervals hold."""
+    """Error one second after t0, largest later error, time until it stays small, and whether intervals hold."""
     later = [(t - t0, m / mass - 1, ci) for t, m, ci in rows if t >= t0]
     out = [t for t, e, _ in later if abs(e) > WITHIN]
     from_one = [(t, e, ci) for t, e, ci in later if t >= 1.0]
@@ -262,7 +262,7 @@ def _errors(rows: Sequence[tuple[float, float, Any]], t0: float, mass: float) ->
 
 
 def _settled(masses: Sequence[tuple[float, float]], t0: float, mass: float) -> float | None:
-    """s after the event from which the controller's mass was within the aim for good; None if it never was."""
+    """Time after the event [s] from which the controller's mass stays within the aim; None if never."""
     if not masses or abs(masses[-1][1] / mass - 1) > WITHIN:
         return None
     wrong = [k for k, (_, m) in enumerate(masses) if abs(m / mass - 1) > WITHIN]
@@ -274,7 +274,7 @@ def _settled(masses: Sequence[tuple[float, float]], t0: float, mass: float) -> f
 
 
 def run(folder: Path, *, seeds: int, minutes: float) -> None:
-    """Fly what is missing; one line of flights.jsonl a flight."""
+    """Fly the missing flights; one line of flights.jsonl for each."""
     folder.mkdir(parents=True, exist_ok=True)
     path, until = folder / "flights.jsonl", time.monotonic() + 60.0 * minutes
     done = {(r["case"], r["seed"]) for r in read(path)}
@@ -292,7 +292,7 @@ def run(folder: Path, *, seeds: int, minutes: float) -> None:
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """The flights of a file; a line that was cut off is left out."""
+    """The flights of a file without an incomplete last line."""
     found = []
     for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
         try:
@@ -303,7 +303,7 @@ def read(path: Path) -> list[dict[str, Any]]:
 
 
 def score(flights: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """A row a case."""
+    """The results, one row for each case."""
     table: dict[str, Any] = {}
     for case in (*CASES, *UNAWARE):
         rows = [r for r in flights if r["case"] == case.name]
@@ -366,7 +366,7 @@ def tables(table: Mapping[str, Any]) -> str:
 
 
 def plot(flights: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Error of the mass around the event, every flight a line."""
+    """Plot the error of the mass around the event, one line for each flight."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -389,7 +389,7 @@ def plot(flights: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def write_docs(flights: Sequence[Mapping[str, Any]], table: Mapping[str, Any]) -> None:
-    """Tables, figures and plot of docs/results/payload_steps.md."""
+    """Write tables, figures and plot of docs/results/payload_steps.md."""
     page = DOCS / "payload_steps.md"
     head, rest = page.read_text(encoding="utf-8").split(MARKS[0])
     tail = rest.split(MARKS[1])[1]

@@ -1,8 +1,8 @@
 """The E-step with dynamax 1.x: its extended Kalman filter and smoother, jit-compiled by JAX for the CPU, 64 bit.
 
-Same window, same parameters, same midpoint discretisation, with roll, pitch and yaw for the attitude (dynamax knows no
-manifolds). The process noise, which depends on the state, is tabled beforehand from the measured attitude and given to
-dynamax for nothing; dynamax has no lag-one statistics and no M-step, so it does less than the pass it is compared with.
+Same window, same parameters, same midpoint discretisation, with roll, pitch and yaw for the attitude (dynamax has no
+manifolds). The process noise, which depends on the state, is computed from the measured attitude outside the measured
+time. dynamax has no lag-one statistics and no M-step, so it does less than the pass of the comparison.
 """
 
 from collections.abc import Callable
@@ -56,7 +56,7 @@ def make(window: Window) -> Callable[[], float]:
     inputs = jnp.asarray(np.column_stack([steps, window.thrust, window.torque]))
     y = jnp.asarray(euler_measurements(window))
 
-    # parameters are arguments, as in an EM iteration, so that nothing is folded at compile time
+    # parameters are arguments, as in an EM iteration, so that the compiler cannot treat them as constants
     @jax.jit
     def smooth(mean: Any, cov: Any, q: Any, r: Any, y: Any, inputs: Any) -> Any:
         p = params._replace(initial_mean=mean, initial_covariance=cov, dynamics_covariance=q, emission_covariance=r)

@@ -1,8 +1,7 @@
 """The E-step in plain numpy, written for speed: preallocated arrays, one transition matrix filled in place, no objects.
 
 Extended Kalman filter with one joint measurement update per sample and Rauch-Tung-Striebel smoother over the error
-state, as somebody in a hurry but with a profiler would write it. benchmarks/reference.py is the same in
-textbook form, written to be read.
+state, optimised with a profiler. benchmarks/reference.py is the same in textbook form.
 """
 
 from collections.abc import Callable

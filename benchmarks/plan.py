@@ -48,7 +48,7 @@ LAGS = (0.03, 0.07)  # s
 
 @dataclass(frozen=True)
 class Course:
-    """A trajectory made of samples, in the shape in which `closed_loop.fly` takes manoeuvres."""
+    """A trajectory made of samples, in the form of the manoeuvres of `closed_loop.fly`."""
 
     duration: float
     sampled: Callable[[NDArray[np.float64]], NDArray[np.float64]]  # (n,) s -> (4 orders, n, 4 axes)
@@ -95,7 +95,7 @@ def of_trajectory(made: Trajectory) -> Course:
 
 
 def to_limits(course: Course, vehicle: Vehicle) -> Course:
-    """As large as the limits allow, by the model."""
+    """The course scaled to the limits, by the model."""
     for _ in range(4):
         used = LIMITS.used(course, closed_loop.fly(course, vehicle), vehicle).max()  # type: ignore[arg-type]
         course = course.scaled(0.99 / float(used))
@@ -103,7 +103,7 @@ def to_limits(course: Course, vehicle: Vehicle) -> Course:
 
 
 def manoeuvres(vehicle: Vehicle, folder: Path, *, seed: int) -> tuple[dict[str, Trajectory], dict[str, Harmonics]]:
-    """What is flown, and those of these that are plans, which are kept in the folder."""
+    """All manoeuvres, and the plans among them, which are kept in the folder."""
     known = {}
     for kind, seconds in (("plan", DURATION), ("plan, a third of the time", DURATION / 3)):
         file = folder / f"{seconds:.0f}s.toml"
@@ -122,7 +122,7 @@ def manoeuvres(vehicle: Vehicle, folder: Path, *, seed: int) -> tuple[dict[str, 
 
 
 def world(seed: int) -> tuple[Scenario, dict[str, float]]:
-    """A drone and its day, and the true values of what is scored."""
+    """A drone on a day, and the true values of the scored parameters."""
     random = np.random.default_rng([seed, 43])
     vehicle = load_vehicle("cf2")
     mass = vehicle.mass * float(random.uniform(*FACTORS["mass"]))
@@ -153,7 +153,7 @@ def world(seed: int) -> tuple[Scenario, dict[str, float]]:
 
 
 def estimated(log: Log, vehicle: Vehicle) -> tuple[dict[str, Any], WindowEM]:
-    """What the estimator says of the manoeuvre alone; and its window."""
+    """The estimate from the manoeuvre alone, and the estimator's window."""
     estimator = OnlineEstimator(
         vehicle, attitude_period=ATTITUDE_PERIOD, prediction_period=PERIOD, every=3000, window=2000
     )
@@ -171,7 +171,7 @@ def estimated(log: Log, vehicle: Vehicle) -> tuple[dict[str, Any], WindowEM]:
 
 
 def flown(log: Log) -> dict[str, float]:
-    """Furthest from the hover point [m] and steepest tilt [deg], by the onboard estimate."""
+    """Largest distance from the hover point [m] and largest tilt [deg], by the onboard estimate."""
     far, tilt = np.zeros(3), 0.0
     for s in log.samples():
         if not log.start + 2.0 <= s.time <= log.end:
@@ -189,7 +189,7 @@ def one_seed(seed: int, made: dict[str, Trajectory], plans: dict[str, Harmonics]
     scenario, truth = world(seed)
     vehicle = load_vehicle("cf2")
     random = np.random.default_rng([seed, 44])
-    # what pushes have told the controller by then
+    # the mass of the controller after earlier pushes
     beliefs = {"ctrlLee.mass": truth["mass"] * float(1.0 + 0.003 * random.standard_normal())}
     out: dict[str, Any] = {"seed": seed, "truth": truth, "flights": {}}
     quiet = fly(scenario, 10 * seed, hover(position=PLACE, duration=8.0), beliefs=beliefs, correction=-2.0)
@@ -212,7 +212,7 @@ def one_seed(seed: int, made: dict[str, Trajectory], plans: dict[str, Harmonics]
 
 
 def fly_all(seeds: int, first: int, folder: Path) -> None:
-    """Fly what is missing."""
+    """Fly the missing flights."""
     folder.mkdir(parents=True, exist_ok=True)
     begun = time.process_time()
     made, plans = manoeuvres(load_vehicle("cf2"), folder, seed=0)

@@ -169,7 +169,7 @@ def write_csv(path: Path, *, rows: int) -> None:
 
 
 def make(folder: Path, *, rows: int) -> dict[str, list[str]]:
-    """The files: format -> arguments of a command on it. In processes of their own, which keeps this one small."""
+    """Make the files: format -> arguments of a command on it. Other processes make them, to keep this one small."""
     usd, csv, mapping = folder / "log00", folder / "plain.csv", folder / "map.toml"
     mcap, exported, part = folder / "imported.mcap", folder / "exported.csv", folder / "part.mcap"
     mapping.write_text(MAPPING)
@@ -269,7 +269,7 @@ def measure_peers(files: dict[str, list[str]], *, rounds: int) -> list[dict[str,
 
 
 def row(name: str, what: str, used: list[Usage], size: int) -> dict[str, Any]:
-    """Least, median and most of some runs."""
+    """A row with minimum, median and maximum of some runs."""
     result: dict[str, Any] = {"format": name, "what": what, "bytes": size, "rounds": len(used)}
     for key in ("wall_s", "processor_s", "memory_mb"):
         values = [getattr(u, key) for u in used]
@@ -292,7 +292,7 @@ def table(rows: list[dict[str, Any]], *, limits: tuple[float, float] | None = No
 
 
 def measure(folder: Path, *, rows: int, rounds: int, only: set[str]) -> dict[str, Any]:
-    """Everything that is asked for; files go into `folder`."""
+    """Make the requested measurements; files go into `folder`."""
     result: dict[str, Any] = {"rows": rows}
     if only & {"commands", "peers"}:
         files = make(folder, rows=rows)

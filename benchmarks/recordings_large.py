@@ -42,7 +42,7 @@ def make(folder: Path, kind: str, *, megabytes: float) -> list[str]:
 
 
 def measure(kind: str, *, megabytes: float, limit_mb: float) -> list[dict[str, Any]]:
-    """A row a command: how it ended, seconds, peak memory."""
+    """A row for each command: exit, seconds, peak memory."""
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -1,9 +1,9 @@
-"""The estimator's inner loops in plain numpy and textbook form: the slow twin that tests hold the kernels against.
+"""The estimator's inner loops in plain numpy and textbook form: the slow reference of the kernels in tests.
 
 Extended Kalman filter with dense matrices and joint measurement updates; Rauch-Tung-Striebel smoother with the
 covariance of the state at both ends of a step (lag-one); expectations taken from those. With an
-accelerometer the state is augmented by the impulse of the step, of which the measurement is a component. Nothing here
-is shared with the kernels but the model (rigid_body.py).
+accelerometer the state is augmented by the impulse of the step, of which the measurement is a component. With the
+kernels it shares the model only (rigid_body.py).
 """
 
 from typing import NamedTuple
@@ -145,7 +145,7 @@ def augmented_smoother(
 
     force (n, 3) mean body-frame specific force over the step that ends at each sample [m/s^2], NaN where missing;
     r_force its variance; the rest as in `extended_kalman_filter`. The step is linearised at the impulse that the
-    accelerometer alone suggests, and all that was measured at a sample is one joint update.
+    accelerometer alone suggests, and all measurements of a sample are one joint update.
     """
     n = len(time)
     transition, predicted_cov = np.zeros((n, 18, 18)), np.zeros((n, 18, 18))

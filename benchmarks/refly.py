@@ -39,12 +39,12 @@ time_constant = 0.068
 
 
 def crazyem(*arguments: str) -> None:
-    """Run the command as a user does."""
+    """Run the command line."""
     subprocess.run([sys.executable, "-m", "crazyem", *arguments], check=True)
 
 
 def fly(folder: Path, name: str, *, seed: int, duration: float) -> Path:
-    """Fly the mission by a scenario; nothing is pushed."""
+    """Fly the mission with a scenario, without pushes."""
     recording = folder / f"{name}.mcap"
     if not recording.exists():
         crazyem("fly", "--scenario", str(folder / f"{name}.toml"), "--trajectory", "figure8", "--duration",

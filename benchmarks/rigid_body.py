@@ -1,7 +1,7 @@
 """The rigid body in plain numpy: a step of the model of crazyem.estimation.kernels, and the step's analytic Jacobian.
 
-Notation as there. The plain twin of the kernels (reference.py) and tests stand on this; crazyem itself runs the
-compiled pieces of crazyem.estimation.kernels.algebra.
+Notation as there. reference.py and tests use this module; crazyem itself runs the compiled functions of
+crazyem.estimation.kernels.algebra.
 """
 
 from typing import NamedTuple
@@ -111,14 +111,14 @@ def bridge_covariance(noise: NDArray, q: NDArray, *, dt: float, lead: float = 0.
     """Covariance (12, 12) that white noise adds within a step beyond its impulse.
 
     The integral of a Brownian motion given both its ends is uncertain by dt^3/12 times its intensity: position and
-    attitude do not follow exactly from the velocities at the ends. Leaving this out makes rates look noisier than they
-    are, and with them inertia too large (8 % on hover data at 100 Hz).
+    attitude do not follow exactly from the velocities at the ends. Without this term the estimated noise of rates and
+    the inertia are too large (inertia by 8 % on hover data at 100 Hz).
 
     Args:
         noise: (12, 6) from `step_jacobians`.
         q: (6,) impulse variances per second.
         dt: length of the step [s].
-        lead: rule of integration; zero but for the midpoint rule, as nothing happens within a step of the others.
+        lead: rule of integration; the covariance is zero except for the midpoint rule.
     """
     if lead != 0.5:
         return np.zeros((12, 12))

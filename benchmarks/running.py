@@ -1,4 +1,4 @@
-"""A running estimator under the clock and against itself: cost of its updates, accuracy of the incremental ones."""
+"""Cost of the updates of a running estimator, and accuracy of its incremental updates."""
 
 import copy
 import math
@@ -36,7 +36,7 @@ def e_step(em: WindowEM, first: int, last: int) -> float:
 
 
 def full_pass(em: WindowEM, first: int, last: int) -> Parameters:
-    """One whole EM iteration: inputs for the present lag, E-step, M-step. The parameters stay as they are."""
+    """One whole EM iteration: inputs for the present lag, E-step, M-step. The parameters of `em` stay unchanged."""
     em.refill_inputs(first, last)
     e_step(em, first, last)
     return em.maximise(first, last)
@@ -90,9 +90,9 @@ def measure_online(*, seed: int, window: int, seconds: float) -> dict[str, Any]:
 def measure_accuracy(*, seeds: Sequence[int], window: int, seconds: float, passes: int = 100) -> dict[str, Any]:
     """Relative difference (n, 4) of the running parameters from two full-window estimates.
 
-    One is a single full pass from the running parameters, which shows what the incremental E-step loses; the other is
-    iterated until the score test is passed (or `passes`), which adds what had not converged before. Compared just
-    before each periodic full pass, when the parameters have been updated incrementally the longest.
+    The first is a single full pass from the running parameters: it shows the loss of the incremental E-step. The second
+    is iterated until the score test is passed (or `passes`): it adds the lack of convergence. The comparison is just
+    before each periodic full pass, after the longest time of incremental updates.
     """
     references: dict[str, list[NDArray]] = {"one full pass": [], "converged": []}
     widths: list[NDArray] = []

@@ -44,18 +44,18 @@ from crazyem.live.write_supervisor import WriteRules
 from crazyem.recordings import open_recording
 from crazyem.vehicle import load_vehicle
 
-PROBE = "hlCommander.vtoff"  # take-off speed of commands that name none: ours all name a duration
+PROBE = "hlCommander.vtoff"  # take-off speed of commands without a duration; all our commands have one
 ROWS = 400  # of the series, at most
 IN_TOUCH = 0.5  # s since the newest packet
-SETTLED = 0.4  # share of the flight after which memory should stand still
-# A battery that lasts, and a mass that the firmware does not know
+SETTLED = 0.4  # share of the flight after which memory should be constant
+# A large battery, and a mass that the firmware does not know
 SCENARIO = "[vehicle]\nmass = 0.032\n[battery]\ncapacity = 50.0\n"
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "results" / "soak.md"
 MARKS = ("<!-- soak: table -->", "<!-- /soak -->")
 
 
 def faults(minutes: float) -> list[dict[str, Any]]:
-    """What the link suffers; times in s of the host's clock, rates of all packets unless kinds are named."""
+    """Faults of the link; times in s of the host's clock, rates of all packets unless kinds are named."""
     out: list[dict[str, Any]] = [
         {"what": "drop", "rate": 0.02, "burst": 2.0},
         {"what": "drop", "rate": 0.1, "direction": "down", "kinds": ["param.write"]},
@@ -64,13 +64,13 @@ def faults(minutes: float) -> list[dict[str, Any]]:
         {"what": "delay", "ms": 2.0, "jitter_ms": 6.0},
     ]
     end = 60.0 * minutes
-    # Short silences of the way down every half minute, a long one (an outage that is told and mended) every five.
+    # Short silences from the drone every half minute; every five minutes a long one (an outage with a reconnection).
     out += [silence(t, 0.3) for t in np.arange(45.0, end, 30.0) if t % 300.0 != 75.0]
     return out + [silence(t, 3.0) for t in np.arange(75.0, end, 300.0)]
 
 
 def silence(start: float, seconds: float) -> dict[str, Any]:
-    """Nothing comes from the drone for so long."""
+    """A fault: no packets from the drone for `seconds`."""
     return {"what": "silence", "direction": "down", "from": float(start), "until": float(start + seconds)}
 
 
@@ -83,7 +83,7 @@ def schedule(wanted: list[dict[str, Any]], seed: int) -> str:
 
 
 class RelayProcess:
-    """`python -m firmware_sim.relay` for the length of a `with` block; `account` is what it counted, at the end."""
+    """`python -m firmware_sim.relay` for the length of a `with` block; `account`: its counts at the end."""
 
     def __init__(self, target: str, file: Path) -> None:
         self._command = [sys.executable, "-m", "firmware_sim.relay", target, "--schedule", str(file), "--json"]
@@ -118,7 +118,7 @@ def resident_mb(pid: int | str) -> float:
 class Writer:
     """Writes a new value of the probe once a second, by the pusher's own code, and reads it back."""
 
-    controller, stopped = LEE, ""  # what the pusher needs of a guard
+    controller, stopped = LEE, ""  # the attributes of a guard that the pusher uses
 
     def __init__(self, session: Session, seed: int) -> None:
         self._session, self._random = session, random.Random(seed)
@@ -134,7 +134,7 @@ class Writer:
         self._thread.start()
 
     def stop(self, reason: str) -> None:
-        """Told by the pusher when a write was given up; the soak goes on."""
+        """Called by the pusher after a failed write; the soak goes on."""
 
     def _attempted(self, write: ParameterWrite) -> None:
         self.counts["unacknowledged"] += not write.verified
@@ -142,7 +142,7 @@ class Writer:
             self._session.recorder.parameter_write(write)
 
     def close(self) -> None:
-        """After the write that is under way."""
+        """End the thread after its present write."""
         self._stop.set()
         self._thread.join(60.0)
         self._pusher.close()
@@ -269,7 +269,7 @@ def run(minutes: float, speed: float, seed: int, folder: Path) -> dict[str, Any]
 
 
 def recording_of(file: Path, blocks: dict[int, Any]) -> dict[str, Any]:
-    """What the recording holds: read through our reader, every checksum verified."""
+    """The content of the recording, read by our reader with every checksum."""
     from mcap.reader import make_reader
 
     counts: dict[str, int] = {}
@@ -299,7 +299,7 @@ def summary(result: dict[str, Any]) -> dict[str, Any]:
         column = rows[:, names.index(name)]
         out[name] = {"p99": float(np.percentile(column, 99)), "max": float(column.max()), "end": float(column[-1])}
     rate, newest_late = (rows[late, names.index(n)] for n in ("clock_rate", "newest_late"))
-    told = newest_late < IN_TOUCH  # within an outage the newest packet is old, whatever the clocks do
+    told = newest_late < IN_TOUCH  # in an outage the newest packet is old for another reason than the clocks
     slope = np.polyfit(t[late][told], 1e3 * newest_late[told], 1)[0] if np.sum(told) > 2 else math.nan
     out["clock"] = {
         "drift_ppm": float(1e6 * (rate[-1] * result["speed"] - 1.0)),

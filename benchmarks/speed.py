@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent))  # so that it runs as a file and as a module
+sys.path.insert(0, str(Path(__file__).parent))  # to run as a file and as a module
 
 import reference
 import running
@@ -40,7 +40,7 @@ from crazyem.estimation.online import OnlineEstimator
 
 @dataclass
 class Contender:
-    """Something to time: a call, how many rounds it sits out between two, and what it took [s]."""
+    """A timed call: the function, the number of rounds without it between two calls, and its times [s]."""
 
     name: str
     call: Callable[[], Any]
@@ -79,7 +79,7 @@ def window_of(em: WindowEM, first: int, last: int) -> Window:
 
 
 def scored_pass(em: WindowEM, first: int, last: int, *, in_step: bool = False) -> Parameters:
-    """A full pass that also gets score and information; `in_step`: of a log sampled in step with predictions."""
+    """A full pass that also gets score and information; `in_step`: of a log sampled in phase with predictions."""
     em.refill_inputs(first, last)
     em.forward(first, last, restart=True)
     em.backward(first, last)
@@ -90,7 +90,7 @@ def scored_pass(em: WindowEM, first: int, last: int, *, in_step: bool = False) -
 
 
 def textbook(window: Window) -> float:
-    """The estimator's own oracle: dense matrices, textbook formulas, plain numpy."""
+    """Run the estimator's reference: dense matrices, textbook formulas, plain numpy."""
     x = reference.state_of(window.prior)
     filtered = reference.extended_kalman_filter(
         window.time, window.y, window.thrust, window.torque, prior=x, prior_cov=window.prior_cov, mass=window.mass,
@@ -101,9 +101,9 @@ def textbook(window: Window) -> float:
 
 
 class Incremental:
-    """A second estimator flying along: each call feeds it until an update is due and does only the incremental pass.
+    """A second running estimator: each call feeds it until an update is due; only the incremental pass is timed.
 
-    Full passes happen where the estimator wants them, outside the clock.
+    Full passes of the estimator are not timed.
     """
 
     def __init__(self, *, seed: int, window: int, seconds: float) -> None:
@@ -143,9 +143,9 @@ class FromNominal:
 
 
 def peers(window: Window, nominal: Window, *, slow_stride: int) -> tuple[list[Contender], list[str]]:
-    """Whatever of the peers is installed, ready to run, and the names of those that are not.
+    """The installed peers, ready to run, and the names of the missing ones.
 
-    Smoothers get the window with its converged parameters, the moving-horizon estimate that with the nominal ones.
+    Smoothers get the window with converged parameters, the moving-horizon estimate the one with nominal parameters.
     """
     import peer_numpy
 

@@ -36,7 +36,7 @@ SLOTS = 5  # moments within 10 ms at which some of the drones' packets arrive
 
 
 class StreamLink:
-    """A link whose packets were made before; see `crazyem.links.base.Link`, of which it has what a watch needs."""
+    """A link with prepared packets; it has the parts of `crazyem.links.base.Link` that a watch needs."""
 
     def __init__(self, seed: int, seconds: float) -> None:
         from flight import VOLTAGE, simulate
@@ -77,7 +77,7 @@ class StreamLink:
 
 
 class Watched:
-    """A session whose latencies are taken."""
+    """A session whose latencies are measured."""
 
     def __init__(self, link: Any, *, number: int, of: int, scheduler: Any, folder: str | None, window: int) -> None:
         from crazyem.estimation.online import OnlineEstimator
@@ -120,7 +120,7 @@ class Watched:
                 self.latencies.append(time.monotonic() - at)
 
     def begin(self) -> None:
-        """What comes from now on counts."""
+        """Start the measurement."""
         self.latencies.clear()
         self.costs = len(self.estimator.update_seconds)
         self.skipped = getattr(self.estimator, "skipped", 0)
@@ -147,11 +147,11 @@ def prefeed(link: StreamLink, watched: Watched) -> None:
         for block in (1, 0):
             for sample in decoders[block].decode(Packet(block, 10 * k + 1000, 0.0, link.rows[k][block])):
                 inner.feed(sample)
-    inner.every, inner._since = every, 0  # or all would make their first update at once, and be in step from then on
+    inner.every, inner._since = every, 0  # else all drones would update at once, now and from then on
 
 
 def run_streams(count: int, *, seconds: float, workers: int | None, record: bool, window: int, cold: bool) -> Any:
-    """One number of drones; raw numbers."""
+    """Measure one number of drones; returns raw numbers."""
     from crazyem.live.scheduler import Scheduler
     from crazyem.live.swarm import shorten_switch_interval
     from crazyem.live.warm_up import warm_up
@@ -214,7 +214,7 @@ def _twin(link: StreamLink, number: int) -> StreamLink:
 
 
 def run_simulator(count: int, *, seconds: float, workers: int | None, record: bool, window: int) -> Any:
-    """The same over UDP and cflib: the swarm simulator beside us on the same cores, each drone hovering."""
+    """The same over UDP and cflib: the swarm simulator runs on the same cores, each drone hovers."""
     from crazyem.links import open_link
     from crazyem.live.scheduler import Scheduler
     from crazyem.live.swarm import shorten_switch_interval
@@ -309,7 +309,7 @@ def _percentiles(values: Any) -> dict[str, float]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """As Markdown: medians of the repetitions, and their range where it says something."""
+    """Markdown: medians of the repetitions, for some figures with their range."""
     lines = [
         "| drones | latency p50 ms | p99 ms (min..max of runs) | later than 40 ms | cost p50 ms | p99 ms "
         "| updates a second and drone | left out | cores | of a core per drone |",
@@ -364,7 +364,7 @@ def plot(rows: Sequence[dict[str, Any]], path: str, title: str) -> None:
 
 
 def child(arguments: argparse.Namespace) -> int:
-    """One number of drones; prints its row as JSON."""
+    """Measure one number of drones and print its row as JSON."""
     load = os.getloadavg()[0]
     options = {"workers": arguments.workers, "record": arguments.record, "window": arguments.window}
     if arguments.source == "streams":
@@ -373,7 +373,7 @@ def child(arguments: argparse.Namespace) -> int:
         raw = run_simulator(arguments.one, seconds=arguments.seconds, **options)
     print(json.dumps(summarised({**raw, "load": load}, arguments.one)))
     sys.stdout.flush()
-    os._exit(0)  # threads of links that are slow to end are none of the measurement
+    os._exit(0)  # do not wait for threads of links that are slow to end
 
 
 def main(argv: Sequence[str] | None = None) -> int:

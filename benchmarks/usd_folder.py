@@ -51,7 +51,7 @@ def _layout(variables: list[str]) -> np.dtype[np.void]:
 
 
 def _records(variables: list[str], identifier: int, count: int, *, period: int, seed: int) -> np.ndarray:
-    """(count,) records: a slow random walk in every variable, which no reader can tell from a flight."""
+    """(count,) records: a slow random walk in every variable, as good as a flight for a reader."""
     rng = np.random.default_rng(seed)
     rows = np.zeros(count, _layout(variables))
     rows["id"], rows["t"] = identifier, 1_000_000 + period * np.arange(count)
@@ -77,7 +77,7 @@ def make(*, kilobytes: int, interleaved: bool, seed: int) -> bytes:
 
 
 def plain(path: Path) -> int:
-    """The peer: samples it put into lists."""
+    """The peer: number of samples in its lists."""
     data = path.read_bytes()
     at = 5
     events: dict[int, tuple[str, int, list[list[float]]]] = {}
@@ -101,14 +101,14 @@ def plain(path: Path) -> int:
 
 
 def ours(path: Path) -> int:
-    """crazyem: values in its signals."""
+    """crazyem: number of values in its signals."""
     from crazyem.recordings import open_recording
 
     return sum(array.value.size for array in open_recording(path).signals.values())
 
 
 def timed(call: Callable[[], Any]) -> float:
-    """Seconds."""
+    """Seconds of a call."""
     begin = time.perf_counter()
     call()
     return time.perf_counter() - begin

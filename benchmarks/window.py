@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Window:
-    """One window of a flight, with all that an extended Kalman smoother needs to know.
+    """One window of a flight, with all inputs of an extended Kalman smoother.
 
     Attributes:
         time: (n,) s.

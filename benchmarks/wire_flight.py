@@ -1,8 +1,7 @@
 """A flight of the simulated firmware in this process, without sockets or clocks: bytes in, log packets out.
 
-Commands and log packets are those of the wire, byte for byte; what is left out is the host's time. So a flight of 35 s
-takes a second or two, does not depend on the machine's load, and is the same every time. The truth stays with the
-scenario.
+Commands and log packets have the bytes of the wire; only the host's time is left out. So a flight of 35 s takes a
+second or two, does not depend on the machine's load, and is always the same. The truth is in the scenario.
 """
 
 import math
@@ -94,7 +93,7 @@ class Log:
 
 
 class Client:
-    """Speaks to a simulated firmware byte for byte; time passes only in `wait`."""
+    """A client of a simulated firmware that sends bytes; time passes only in `wait`."""
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
         flight = Flight(scenario, seed)
@@ -111,7 +110,7 @@ class Client:
         self.firmware.receive(packet)
 
     def wait(self, milliseconds: int) -> None:
-        """Let time pass; log packets are kept, all else is not needed here."""
+        """Let time pass; keep log packets and drop the others."""
         self.firmware.advance(milliseconds)
         for datagram, _ in self.firmware.outbox:
             packet = wire.decode(datagram)
@@ -152,7 +151,7 @@ def fly(
     """Take off to 1 m, hover 2 s, fly the trajectory under the Lee controller, and log what `crazyem fly` logs.
 
     Args:
-        scenario: what is true. seed: of all noise.
+        scenario: the truth. seed: of all noise.
         trajectory: around (0, 0, 1) m.
         beliefs: parameters written `correction` seconds into the trajectory, as pushes would.
 
