@@ -48,7 +48,7 @@ Kind = tuple[str, str, str]  # start, reference, sensor
 
 
 def version() -> str:
-    """A hash of the settings and of all code that a flight depends on (without comments)."""
+    """A hash of the settings and of all code that a flight depends on (without comments, but with docstrings)."""
     digest = hashlib.sha256(repr([astuple(settings) for settings in REFERENCES.values()]).encode())
     digest.update(ast.dump(ast.parse(Path(__file__).with_name("cold_start_study.py").read_bytes())).encode())
     of_paper = ("bound", "flight", "plant", "product", "settings")

@@ -38,7 +38,7 @@ def ideal_nats(
     `vehicle` has all true properties that are not hidden, whether the diagnosis knows them or not.
 
     In either model, unknown quantities have their best values: noise scales, a memory of the torques or none, and the
-    nuisances. None if the effect does not act on the likelihood of the flight: accelerometer, gusts, and effects before
+    nuisances. None if the likelihood of the flight does not show the effect: accelerometer, gusts, and effects before
     rotors whose speeds are measured.
     """
     seen = open_recording(str(recording), options_of(mapping))
@@ -67,7 +67,7 @@ def ideal_nats_of_each(
 
 
 def _beyond(effects: Mapping[str, Mapping[str, Any]], seen: Recording) -> bool:
-    """Whether these effects do not act on the likelihood of the flight."""
+    """Whether the likelihood of the flight does not show these effects."""
     return bool(ASIDE & set(effects) or (BEFORE_ROTORS & set(effects) and "rotor_speed" in seen.signals))
 
 

@@ -1,4 +1,4 @@
-"""The files of a study. The diagnosing process gets only the folder of the cases, not the folder of the truth."""
+"""The files of a study: which folder a file is in decides whether the diagnosing process may get the file."""
 
 import json
 import os
