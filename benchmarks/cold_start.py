@@ -10,7 +10,6 @@ Lines of an older version of the code are flown again. The judging is done in be
 """
 
 import argparse
-import ast
 import hashlib
 import json
 import math
@@ -35,6 +34,7 @@ from cold_start_study import (
     summarise,
 )
 
+from crazyem.paper.runner import meaning
 from crazyem.paper.settings import LITERAL
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -48,14 +48,14 @@ Kind = tuple[str, str, str]  # start, reference, sensor
 
 
 def version() -> str:
-    """A hash of the settings and of all code that a flight depends on (without comments, but with docstrings)."""
+    """A hash of the settings and of all code that a flight depends on, without comments and docstrings."""
     digest = hashlib.sha256(repr([astuple(settings) for settings in REFERENCES.values()]).encode())
-    digest.update(ast.dump(ast.parse(Path(__file__).with_name("cold_start_study.py").read_bytes())).encode())
+    digest.update(meaning(Path(__file__).with_name("cold_start_study.py")).encode())
     of_paper = ("bound", "flight", "plant", "product", "settings")
     for folder in ("paper", "estimation", "control", "physics"):
         for path in sorted((ROOT / "crazyem" / folder).rglob("*.py")):
             if folder != "paper" or path.stem in of_paper:
-                digest.update(ast.dump(ast.parse(path.read_bytes())).encode())
+                digest.update(meaning(path).encode())
     return digest.hexdigest()[:16]
 
 

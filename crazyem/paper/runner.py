@@ -40,15 +40,24 @@ def _hash(with_estimator: bool) -> str:
         name = path.relative_to(_PACKAGE).as_posix()
         ours = name == "paper/product.py" or name.startswith("estimation/")
         if name not in _NOT_CODE and (with_estimator or not ours):
-            digest.update(f"{name}\0{_meaning(path)}\0".encode())
+            digest.update(f"{name}\0{meaning(path)}\0".encode())
     return digest.hexdigest()[:16]
 
 
 @cache
-def _meaning(path: Path) -> str:
-    """The content of a file without comments and layout, which do not affect results."""
+def meaning(path: Path) -> str:
+    """The content of a file without comments, docstrings and layout, which do not affect results."""
     text = path.read_text(encoding="utf-8")
-    return ast.dump(ast.parse(text)) if path.suffix == ".py" else text
+    if path.suffix != ".py":
+        return text
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if (
+            isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+            and ast.get_docstring(node, clean=False) is not None
+        ):
+            del node.body[0]
+    return ast.dump(tree)
 
 
 def environment() -> dict[str, Any]:

@@ -107,6 +107,17 @@ def test_another_setting_is_another_fingerprint() -> None:
             assert runner.fingerprint(changed, "crazyem") != usual, field.name
 
 
+def test_numbers_depend_on_code_and_not_on_its_texts(tmp_path: Path) -> None:
+    documented = '"""A."""\n\n\ndef f():\n    """Of f."""\n    return 1  # one\n'
+    texts = (documented, "def f():\n    return 1\n", "def f():\n    return 2\n")
+    files = [tmp_path / f"{k}.py" for k in range(3)]
+    for path, text in zip(files, texts, strict=True):
+        path.write_text(text)
+    one, same, other = (runner.meaning(path) for path in files)
+    assert one == same
+    assert other != same
+
+
 @pytest.mark.slow
 def test_only_our_own_numbers_depend_on_the_estimator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A change of the estimator must not call for the published method again, one of the plant for both."""
@@ -116,7 +127,7 @@ def test_only_our_own_numbers_depend_on_the_estimator(tmp_path: Path, monkeypatc
 
     def hashes() -> dict[str, str]:
         runner._hash.cache_clear()
-        runner._meaning.cache_clear()
+        runner.meaning.cache_clear()
         return {m: runner.code_hash(m) for m in methods}
 
     def changed(name: str, addition: bytes = b"\nCHANGED = 1\n") -> list[str]:
