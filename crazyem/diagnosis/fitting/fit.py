@@ -319,8 +319,7 @@ def refine(
 ) -> Fitted:
     """Maximum of the posterior near `start`, a model that contains the effects of the candidates.
 
-    The `nuisances` are free, too. Their priors have the given precisions about neutral, or about the values in `about`;
-    they are normal, or Student's t (`Candidate.freedom`).
+    The `nuisances` are free, with normal or Student's t priors (`Candidate.freedom`) about neutral or about `about`.
 
     Raises: DivergedError if the filter leaves the range of numbers at `start`.
     """
