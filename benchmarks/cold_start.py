@@ -34,7 +34,7 @@ from cold_start_study import (
     summarise,
 )
 
-from crazyem.paper.runner import meaning
+from crazyem.paper.runner import code_of
 from crazyem.paper.settings import LITERAL
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,12 +50,12 @@ Kind = tuple[str, str, str]  # start, reference, sensor
 def version() -> str:
     """A hash of the settings and of all code that a flight depends on, without comments and docstrings."""
     digest = hashlib.sha256(repr([astuple(settings) for settings in REFERENCES.values()]).encode())
-    digest.update(meaning(Path(__file__).with_name("cold_start_study.py")).encode())
+    digest.update(code_of(Path(__file__).with_name("cold_start_study.py")).encode())
     of_paper = ("bound", "flight", "plant", "product", "settings")
     for folder in ("paper", "estimation", "control", "physics"):
         for path in sorted((ROOT / "crazyem" / folder).rglob("*.py")):
             if folder != "paper" or path.stem in of_paper:
-                digest.update(meaning(path).encode())
+                digest.update(code_of(path).encode())
     return digest.hexdigest()[:16]
 
 

@@ -8,8 +8,6 @@ from pathlib import Path
 
 from crazyem.errors import UsageError
 
-TEMPORARY_PREFIX = ".crazyem-"  # of the names of incomplete files; a killed process leaves one behind
-
 
 @contextlib.contextmanager
 def new_file(path: Path, *, force: bool = False) -> Iterator[Path]:
@@ -22,7 +20,7 @@ def new_file(path: Path, *, force: bool = False) -> Iterator[Path]:
             raise UsageError(f"{path} is a directory.")
         if not force and path.exists():
             raise UsageError(f"{path} exists already (--force replaces it).")
-        handle, name = tempfile.mkstemp(prefix=TEMPORARY_PREFIX, suffix=path.suffix, dir=path.parent)
+        handle, name = tempfile.mkstemp(prefix=".crazyem-", suffix=path.suffix, dir=path.parent)
         os.close(handle)
     except (OSError, ValueError) as error:
         raise UsageError(f"cannot write {path}: {getattr(error, 'strerror', None) or error}.") from None

@@ -11,7 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from crazyem.atomic_file import TEMPORARY_PREFIX, write_file
+from crazyem.atomic_file import write_file
 from crazyem.errors import UsageError
 from crazyem.paper.experiments import Task, run_task
 from crazyem.paper.settings import Settings, described
@@ -40,12 +40,12 @@ def _hash(with_estimator: bool) -> str:
         name = path.relative_to(_PACKAGE).as_posix()
         ours = name == "paper/product.py" or name.startswith("estimation/")
         if name not in _NOT_CODE and (with_estimator or not ours):
-            digest.update(f"{name}\0{meaning(path)}\0".encode())
+            digest.update(f"{name}\0{code_of(path)}\0".encode())
     return digest.hexdigest()[:16]
 
 
 @cache
-def meaning(path: Path) -> str:
+def code_of(path: Path) -> str:
     """The content of a file without comments, docstrings and layout, which do not affect results."""
     text = path.read_text(encoding="utf-8")
     if path.suffix != ".py":
@@ -90,12 +90,10 @@ def run_and_store(task: Task, settings: Settings, folder: str, stamp: str) -> No
 
 
 def prepare(folder: Path) -> None:
-    """Make the output folder and delete incomplete files of a stopped run. Raises UsageError: it cannot be made."""
+    """Make the output folder. Raises UsageError: it cannot be made."""
     try:
         (folder / "tasks").mkdir(parents=True, exist_ok=True)
         (folder / "figures").mkdir(exist_ok=True)
-        for unfinished in (folder / "tasks").glob(f"{TEMPORARY_PREFIX}*"):
-            unfinished.unlink()
     except OSError as error:
         raise UsageError(f"cannot make the folder {folder}: {error.strerror or error}.") from None
 

@@ -1,6 +1,8 @@
 """Score and information by blocks: fits of columns against scipy, folds by hand, p-values and errors by simulation."""
 
 import itertools
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import optimize, stats
 
 from crazyem.diagnosis.fitting.gram import CHUNK, FOLDS, MANY, Gram, bounded
+from crazyem.diagnosis.naming.trials import dispersion_of
 
 Array = NDArray[np.float64]
 
@@ -209,6 +212,17 @@ def test_what_other_columns_explain_is_no_scatter(dispersion: float) -> None:
     strong = simulated(11, truth=np.array([3.0, 0.0, 0.0]), blocks=400, dispersion=dispersion)
     assert strong.solve([1]).dispersion > 3 * dispersion
     assert strong.solve(range(3), tested=[1]).dispersion == pytest.approx(dispersion, rel=0.3)
+
+
+def test_the_dispersion_of_an_effect_is_that_of_its_own_parameters() -> None:
+    """Independent columns whose scores scatter once, six times and a tenth as much as the model says."""
+    true, blocks = np.array([1.0, 6.0, 0.1]), 600
+    score = np.random.default_rng(3).normal(size=(blocks, 3)) * np.sqrt(true)
+    gram = Gram(score, np.tile(np.eye(3), (blocks, 1, 1)), np.zeros(blocks, int))
+    fitted: Any = SimpleNamespace(gram=gram, precision=np.array([0.0, 0.0, 2.0]))
+    found = [dispersion_of(fitted, 1, offset=k) for k in range(3)]
+    assert found == pytest.approx([1.0, 6.0, 1.0], rel=0.25)  # never less than 1
+    assert dispersion_of(fitted, 2, offset=0) == pytest.approx(3.5, rel=0.25)  # the median of both
 
 
 def test_scatter_in_few_blocks_is_neither_too_small_nor_too_large_beside_others() -> None:

@@ -1,6 +1,7 @@
 """What a name is said with: inertias that are one factor on the torques, and a group that says so."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -25,14 +26,14 @@ from crazyem.diagnosis.naming.answer import _numbers, _rivals, _uncertainty, str
 from crazyem.diagnosis.naming.determined import improbable
 from crazyem.diagnosis.naming.named import DOUBTFUL, Named, one_factor, trust
 from crazyem.diagnosis.naming.presence import (
-    CALIBRATED,
-    CONSTANT,
-    ELSEWHERE,
-    FITTED,
     FREEDOM,
+    GAIN_POWER,
+    INTERCEPT,
     LEAST_PROBABILITY,
-    ORDER,
-    THERE,
+    MOST_PROBABLE,
+    ORDER_POWER,
+    OTHER_SD,
+    REAL_SD,
     held_out_evidence,
     presence,
 )
@@ -88,13 +89,23 @@ NATS = st.floats(-100.0, 1e4)
 @given(NATS, NATS, NATS, st.floats(0.0, 1e4))
 def test_more_evidence_never_makes_a_name_less_sure(one: float, other: float, beside: float, expected: float) -> None:
     least, most = sorted((one, other))
-    assert 0.0 <= presence(least, beside, expected) <= presence(most, beside, expected) <= CALIBRATED
-    assert 0.0 <= presence(beside, least, expected) <= presence(beside, most, expected) + 1e-12 <= CALIBRATED + 1e-12
+    assert 0.0 <= presence(least, beside, expected) <= presence(most, beside, expected) <= MOST_PROBABLE
+    assert 0.0 <= presence(beside, least, expected) <= presence(beside, most, expected) + 1e-12 <= MOST_PROBABLE + 1e-12
 
 
 @given(NATS, st.floats(-100.0, 0.0))
 def test_flight_that_can_tell_nothing_of_an_effect_says_nothing_of_it(held: float, expected: float) -> None:
     assert held_out_evidence(held, expected) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_trial_is_judged_by_what_is_expected_of_it_on_held_out_flights() -> None:
+    """30 nats over a dispersion of 3; without held-out flights, as many are expected of blocks as of the whole."""
+    trial = Trial(Candidate("linear_drag", (), ("x",)), 90.0, -4.0, 3.0, 1e-9, 26.0)
+    for expected, of_trial in ((0.0, 0.0), (27.0, 27.0), (90.0, None)):
+        found = replace(trial, expected=of_trial).presence(2)
+        assert found == pytest.approx(presence(30.0, -4.0, expected, 2, dispersion=3.0))
+    hover, quick = (replace(trial, expected=e).presence(1) for e in (0.0, 90.0))
+    assert hover > 1.3 * quick
 
 
 def test_a_name_is_as_sure_as_what_it_brings_on_flight_held_out_and_fitted() -> None:
@@ -103,12 +114,12 @@ def test_a_name_is_as_sure_as_what_it_brings_on_flight_held_out_and_fitted() -> 
     for held, expected, fitted, order in ((5.0, 20.0, 30.0, 1), (30.0, 30.0, 5.0, 2), (-8.0, 80.0, 80.0, 3)):
         density = [
             (1.0 + (held - mean) ** 2 / (FREEDOM * variance)) ** (-0.5 * (FREEDOM + 1.0)) / math.sqrt(variance)
-            for mean, share in ((expected, THERE), (0.0, ELSEWHERE))
+            for mean, share in ((expected, REAL_SD), (0.0, OTHER_SD))
             for variance in (1.0 + 2.0 * 3.0 * expected + (share * expected) ** 2,)
         ]
-        odds = math.exp(CONSTANT) * (1.0 + fitted) ** FITTED / order**ORDER * density[0] / density[1]
+        odds = math.exp(INTERCEPT) * (1.0 + fitted) ** GAIN_POWER / order**ORDER_POWER * density[0] / density[1]
         assert presence(fitted, held, expected, order, dispersion=3.0) == pytest.approx(odds / (1.0 + odds))
-    assert presence(1e9, 1e9, 1e9) == CALIBRATED
+    assert presence(1e9, 1e9, 1e9) == MOST_PROBABLE
     assert improbable(0.9 * LEAST_PROBABILITY).startswith("not determined")
     assert not improbable(1.1 * LEAST_PROBABILITY)
 

@@ -129,8 +129,8 @@ def test_moving_air_has_a_memory(memory, found):
 
 
 def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(monkeypatch):
-    """As in a recording whose forces last for one sample each: the logarithm's error was 30 000."""
-    found = Gusts(5000.0, np.ones(3), 0.25, 3e4, True, 1.6, 0.05)
+    """At the longest memory that is tried the likelihood bends so little that the error of its logarithm is huge."""
+    found = Gusts(5000.0, np.ones(3), 4.0, 3e4, True, 1.6, 0.05)
     monkeypatch.setattr("crazyem.diagnosis.naming.other_likelihoods.find_gusts", lambda data, point: found)
     vehicle, remains = load_vehicle("cf2"), Unexplained((), 0.0)
     data, point = Data(()), Point(vehicle, {}, first_guess())
@@ -143,7 +143,7 @@ def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(m
     ("nats", "confidence"), [(0.0, 0.95), (34.0, 5000.0 / 5034.0 * 0.95), (4000.0, DOUBTFUL * 0.95)]
 )
 def test_gusts_are_as_sure_as_what_they_leave_allows(monkeypatch, nats, confidence):
-    """Where gusts are all there is the regression explains nothing, which says nothing of them (told with 0 once)."""
+    """Where gusts are all there is the regression explains nothing, which says nothing of them."""
     air = Gusts(5000.0, np.ones(3), 0.25, 0.1, True, 1.6, 0.05)
     monkeypatch.setattr("crazyem.diagnosis.naming.other_likelihoods.find_gusts", lambda data, point: air)
     where = Finding("attitude", "y", "changes at 7 s", "time", (7.0, 28.0), 0.04, 0.005, "rad", nats, 1e-7)

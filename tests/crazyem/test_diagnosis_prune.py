@@ -34,7 +34,7 @@ def no_scatter(monkeypatch):
 
 
 def survivors(monkeypatch, *, p_value, held, gained=50.0, held_out=True):
-    """What `without_noise_alike` keeps where torques that wander gain `gained` nats, and the p-values it asked for."""
+    """What `without_noise_look_alikes` keeps where torques that wander gain `gained` nats; p-values it asked for."""
     asked = []
 
     def significance(fitted, count, *, offset):
@@ -47,7 +47,7 @@ def survivors(monkeypatch, *, p_value, held, gained=50.0, held_out=True):
     monkeypatch.setattr(prune, "held_gain", lambda *a: held)
     apart = SimpleNamespace(fit_noise=lambda point: point, loglik=lambda point, passes: gained)
     data = SimpleNamespace(twin=lambda: apart, loglik=lambda point, passes: 0.0)  # what wanders is fitted on a twin
-    _, accepted, steps = prune.without_noise_alike(
+    _, accepted, steps = prune.without_noise_look_alikes(
         data, fitted, [DRAG], [TAKEN], SimpleNamespace() if held_out else None, lambda text: None
     )
     assert bool(accepted) == bool(steps)
@@ -114,7 +114,7 @@ def test_what_holds_another_within_its_range_stays(monkeypatch, slope, kept):
     monkeypatch.setattr(prune, "bare_fit", lambda data, held_out, fitted, accepted, c: (fits[c], 0.0))
     monkeypatch.setattr(prune, "refine_base", lambda *a, **k: bare)
     data = SimpleNamespace(loglik=lambda point, passes: 0.0, settle=lambda point: None, workers=Workers(1))
-    found, accepted, left = prune.eliminated(data, fitted, [scale, curve], steps, None, lambda text: None)
+    found, accepted, left = prune.backward_elimination(data, fitted, [scale, curve], steps, None, lambda text: None)
     assert accepted == ([scale, curve] if kept else [curve])
     assert [s.taken.candidate for s in left] == accepted
     assert found is (fitted if kept else bare)
@@ -137,8 +137,11 @@ def test_flights_held_out_are_asked_where_they_can_answer(monkeypatch, expected,
     monkeypatch.setattr(prune, "refine_base", lambda *a, **k: bare)
     data = SimpleNamespace(loglik=lambda point, passes: 0.0, workers=Workers(1))
     monkeypatch.setattr(prune, "nuisances", lambda *a: [])
-    _, accepted, _ = prune.eliminated(data, fitted, [DRAG], [TAKEN], SimpleNamespace(), lambda text: None)
+    _, accepted, left = prune.backward_elimination(data, fitted, [DRAG], [TAKEN], SimpleNamespace(), lambda text: None)
     assert accepted == ([DRAG] if kept else [])
+    for step in left:  # the probability of an effect is that in the final model
+        taken = step.taken
+        assert (taken.gain, taken.held_out, taken.expected, taken.dispersion) == (300.0, held, expected, 1.0)
 
 
 @pytest.mark.usefixtures("no_scatter")
@@ -159,7 +162,7 @@ def test_what_no_flight_needs_goes_before_what_one_speaks_against(monkeypatch):
     monkeypatch.setattr(prune, "nuisances", lambda *a: [])
     data = SimpleNamespace(loglik=lambda point, passes: 0.0, settle=lambda point: None, workers=Workers(1))
     said = []
-    _, accepted, left = prune.eliminated(data, fitted, [payload, load], steps, SimpleNamespace(), said.append)
+    _, accepted, left = prune.backward_elimination(data, fitted, [payload, load], steps, SimpleNamespace(), said.append)
     assert accepted == [load]
     assert [s.taken.candidate for s in left] == [load]
     assert said == ["  left out again: payload"]
@@ -334,4 +337,4 @@ def test_an_effect_that_leaves_no_hump_is_not_doubted(monkeypatch, left: bool, d
     monkeypatch.setattr(prune, "off_peak_gram", lambda data, point, columns, found: gram(-1.0))
     data = SimpleNamespace(models=[None], gram=lambda point, columns: gram(0.0))
     fitted = SimpleNamespace(point=drone, precision=np.zeros(3))
-    assert prune.vibration_alike(data, POINT, fitted, [DRAG], lambda text: None) == doubted  # type: ignore[arg-type]
+    assert prune.vibration_look_alikes(data, POINT, fitted, [DRAG], lambda text: None) == doubted  # type: ignore[arg-type]

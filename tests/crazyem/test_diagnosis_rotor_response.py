@@ -13,7 +13,7 @@ from crazyem.diagnosis import diagnose as diagnosing
 from crazyem.diagnosis.flights.inputs import inputs_of
 from crazyem.diagnosis.naming.named import DOUBTFUL
 from crazyem.diagnosis.naming.other_likelihoods import late_rotors
-from crazyem.diagnosis.naming.presence import CALIBRATED
+from crazyem.diagnosis.naming.presence import MOST_PROBABLE
 from crazyem.diagnosis.naming.rotor_response import (
     DELAY_SD,
     ENOUGH,
@@ -203,7 +203,7 @@ def test_a_late_rotor_is_as_sure_as_what_speaks_for_it(lag, held_out, deaf):
     odds = found[0].log_odds
     assert odds is not None
     most = float(expit(odds))
-    assert most <= CALIBRATED
+    assert most <= MOST_PROBABLE
     assert found[0].confidence == pytest.approx(min(most, DOUBTFUL) if deaf else most)
 
 

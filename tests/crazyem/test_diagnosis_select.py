@@ -17,7 +17,7 @@ from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.random_torques import peaks
 from crazyem.diagnosis.naming.evidence import gain_of_both
 from crazyem.diagnosis.naming.onset import ONSET, date
-from crazyem.diagnosis.naming.prune import vibration_alike
+from crazyem.diagnosis.naming.prune import vibration_look_alikes
 from crazyem.diagnosis.naming.select import Basis, compared, linear_trials, with_held_out_by
 from crazyem.diagnosis.naming.trials import Trial
 
@@ -93,7 +93,7 @@ def test_an_inertia_that_a_vibration_speaks_for_is_another_beside_it(monkeypatch
     point, fitted = with_free(data, INERTIA)
     assert peaks(data.models[0], point)
     said: list[str] = []
-    assert vibration_alike(data, point, fitted, [INERTIA], said.append) == {"inertia"}
+    assert vibration_look_alikes(data, point, fitted, [INERTIA], said.append) == {"inertia"}
     assert "inertia" in said[0]
 
 
@@ -106,7 +106,7 @@ def test_a_lag_that_makes_its_loop_swing_is_the_same_beside_the_hump(lag: float)
     point, fitted = with_free(data, LAG)
     assert peaks(data.models[0], point)
     assert fitted.point.effects["motor_lag"]["time_constant"] == pytest.approx(lag, rel=0.1)
-    assert not vibration_alike(data, point, fitted, [LAG], lambda text: None)
+    assert not vibration_look_alikes(data, point, fitted, [LAG], lambda text: None)
 
 
 @pytest.mark.slow

@@ -262,6 +262,6 @@ def test_what_wanders_is_fitted_beside_the_flights(monkeypatch) -> None:
     monkeypatch.setattr(pruning, "refine_base", recorded)
     monkeypatch.setattr(pruning, "MEMORY_NATS", -np.inf)
     step: Any = SimpleNamespace(taken=SimpleNamespace(candidate=drag, dispersion=1.0))
-    pruning.without_noise_alike(data, fitted, [drag], [step], None, lambda text: None)
+    pruning.without_noise_look_alikes(data, fitted, [drag], [step], None, lambda text: None)
     assert seen
     assert seen[0] is not data

@@ -113,7 +113,7 @@ def test_numbers_depend_on_code_and_not_on_its_texts(tmp_path: Path) -> None:
     files = [tmp_path / f"{k}.py" for k in range(3)]
     for path, text in zip(files, texts, strict=True):
         path.write_text(text)
-    one, same, other = (runner.meaning(path) for path in files)
+    one, same, other = (runner.code_of(path) for path in files)
     assert one == same
     assert other != same
 
@@ -127,7 +127,7 @@ def test_only_our_own_numbers_depend_on_the_estimator(tmp_path: Path, monkeypatc
 
     def hashes() -> dict[str, str]:
         runner._hash.cache_clear()
-        runner.meaning.cache_clear()
+        runner.code_of.cache_clear()
         return {m: runner.code_hash(m) for m in methods}
 
     def changed(name: str, addition: bytes = b"\nCHANGED = 1\n") -> list[str]:
@@ -248,7 +248,6 @@ def test_a_stopped_run_goes_on(tmp_path: Path) -> None:
         assert json.loads(path.read_text())["record"]
     assert main([*arguments, "--jobs", "1"]) == 0
     assert results(out)["timing"]["tasks_reused"] >= len(done)
-    assert not list(out.glob("tasks/.*"))
 
 
 def test_a_part_of_the_run(tmp_path: Path) -> None:

@@ -41,17 +41,17 @@ def pruned(
     """
     fitted, accepted, steps = selection.fitted, list(selection.accepted), list(selection.steps)
     held_out = held_out and as_held_out(held_out, fitted.point, accepted)
-    fitted, accepted, steps = eliminated(data, fitted, accepted, steps, held_out, say)
+    fitted, accepted, steps = backward_elimination(data, fitted, accepted, steps, held_out, say)
     doubted: frozenset[str] = frozenset()
     if TRIM not in selection.final.vehicle.effects:  # both judge by the scatter of blocks (see `by_gain`)
-        fitted, accepted, steps = without_noise_alike(data, fitted, accepted, steps, held_out, say)
-        doubted = vibration_alike(data, nominal, fitted, accepted, say)
+        fitted, accepted, steps = without_noise_look_alikes(data, fitted, accepted, steps, held_out, say)
+        doubted = vibration_look_alikes(data, nominal, fitted, accepted, say)
     return replace(
         selection, final=fitted.point, steps=tuple(steps), accepted=tuple(accepted), fitted=fitted, doubted=doubted
     )
 
 
-def eliminated(
+def backward_elimination(
     data: Data,
     fitted: Fitted,
     accepted: list[Candidate],
@@ -143,7 +143,7 @@ def bare_fit(
     return less, on_held_out(there, less.point, rest).loglik if there else 0.0
 
 
-def without_noise_alike(
+def without_noise_look_alikes(
     data: Data,
     fitted: Fitted,
     accepted: list[Candidate],
@@ -185,7 +185,7 @@ def held_gain(data: Data, held_out: Data, fitted: Fitted, accepted: Sequence[Can
     return there - bare_fit(data, held_out, fitted, accepted, candidate)[1]
 
 
-def vibration_alike(
+def vibration_look_alikes(
     data: Data, nominal: Point, fitted: Fitted, accepted: Sequence[Candidate], say: Callable[[str], None]
 ) -> frozenset[str]:
     """Effects that have another size without the peaks of the spectrum than with them: a vibration explains them.

@@ -13,7 +13,7 @@ from crazyem.diagnosis.fitting.fit import Fitted
 from crazyem.diagnosis.fitting.gram import MANY, Gram
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import solved
-from crazyem.diagnosis.naming.presence import CALIBRATED, presence
+from crazyem.diagnosis.naming.presence import MOST_PROBABLE, presence
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 SURE = 1e-3  # largest p-value of an effect that is taken, before candidates are counted
@@ -68,10 +68,10 @@ class Trial:
     def presence(self, order: int) -> float:
         """Probability that the effect is real, as the `order`-th that was found (from 1); look-alikes aside."""
         if self.log_odds is not None:
-            return min(CALIBRATED, float(expit(self.log_odds)))
+            return min(MOST_PROBABLE, float(expit(self.log_odds)))
         expected = self.gain if self.expected is None else self.expected
         there = presence(self.gain / self.dispersion, self.held_out, expected, order, dispersion=self.dispersion)
-        return min(CALIBRATED, float(expit(logit(there) + self.other_evidence)))
+        return min(MOST_PROBABLE, float(expit(logit(there) + self.other_evidence)))
 
     @property
     def worth(self) -> float:
