@@ -22,7 +22,7 @@ from crazyem.diagnosis.locating.place import depends_on_place
 from crazyem.diagnosis.naming.alternatives import exchanged, named_again
 from crazyem.diagnosis.naming.answer import Answer, answer_of, strongest_first
 from crazyem.diagnosis.naming.balance import by_balance, hidden_by_the_day
-from crazyem.diagnosis.naming.corroboration import TELLING, false_speed, late_measurements
+from crazyem.diagnosis.naming.corroboration import false_speed, late_measurements
 from crazyem.diagnosis.naming.determined import determined, without_undetermined
 from crazyem.diagnosis.naming.free import Free, left_free
 from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, as_load, as_two
@@ -36,6 +36,7 @@ from crazyem.diagnosis.naming.steady import left_as_trim, with_exact_torques, wi
 from crazyem.diagnosis.naming.steady_odds import steady_selection
 from crazyem.diagnosis.naming.trials import Selection, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained, unexplained
+from crazyem.diagnosis.settings import SELECTION
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.rotors import ROTOR_FAULT
@@ -307,17 +308,17 @@ def _corroborated(
     for candidate in selection.accepted:
         if candidate.effect == INPUT_DELAY.name:
             nats = late_measurements(data.together_with(apart), punctual, candidate.values(selection.final)["delay"])
-            if nats is not None and abs(nats) > TELLING:
+            if nats is not None and abs(nats) > SELECTION.separating:
                 corroborated |= {INPUT_DELAY.name, *(INPUT_DELAY.same_as if nats > 0 else ())}
         elif candidate.effect in (WEAK, MISREAD) and dict(candidate.fixed).get("onset_time") is None:
             nats, other, start = _misread_or_weak(candidate, selection, recordings)
-            if nats is not None and abs(nats) > TELLING:
+            if nats is not None and abs(nats) > SELECTION.separating:
                 corroborated |= {candidate.effect, other.effect}
                 if nats > 0:
                     selection = exchanged(data, selection, candidate, other, [start])
             weak = candidate.effect == WEAK
             for_sensor = (nats or 0.0) if weak else -(nats or 0.0)
-            if for_sensor > (TELLING if weak else 0.0):
+            if for_sensor > (SELECTION.separating if weak else 0.0):
                 # a weak rotor turns as fast as a healthy one, so evidence against its speed is evidence for the sensor
                 selection = selection.with_evidence(other if weak else candidate, for_sensor)
     return selection, frozenset(corroborated)

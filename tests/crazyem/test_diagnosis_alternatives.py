@@ -13,6 +13,7 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.naming import alternatives
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
+from crazyem.diagnosis.settings import SELECTION
 from crazyem.diagnosis.workers import Workers
 
 LOAD = Candidate("payload", (), ("mass", "x", "y", "z"))
@@ -86,7 +87,7 @@ def test_a_name_that_is_still_the_best_stays(monkeypatch):
 
 
 def test_what_was_far_worse_is_not_asked(monkeypatch):
-    monkeypatch.setattr(alternatives, "NEAR", 20.0)
+    monkeypatch.setattr(alternatives, "SELECTION", replace(SELECTION, rival_difference=20.0))
     assert names(asked(monkeypatch, load=100.0, weaker=130.0)) == ["payload", "velocity_moment"]
 
 

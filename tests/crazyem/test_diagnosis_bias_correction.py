@@ -14,10 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.cli import main
 from crazyem.diagnosis.prediction.bias_correction import (
-    FEEDBACK_SD,
-    FORCE_SD,
-    LEAST_TIME,
-    MEMORY,
     Turned,
     Weights,
     correction_weights,
@@ -26,6 +22,7 @@ from crazyem.diagnosis.prediction.bias_correction import (
     remembered,
 )
 from crazyem.diagnosis.prediction.predict import _at_start, predict, recorded
+from crazyem.diagnosis.settings import PREDICTION
 from crazyem.recordings import open_recording
 from crazyem.vehicle import load_vehicle
 
@@ -40,7 +37,7 @@ def flight(seed: int, *, seconds: float, weight: float, offset: float, error: fl
     gained = acceleration * STEP
     rate = np.concatenate([np.zeros((1, 3)), np.cumsum(weight * gained + offset * STEP, axis=0)[:-1]])
     shown = rate + error * draw.standard_normal(rate.shape)
-    start = np.zeros((time.size, 3, len(FEEDBACK_SD)))  # nothing else is known
+    start = np.zeros((time.size, 3, len(PREDICTION.feedback_sd)))  # nothing else is known
     return Turned(time, shown, gained, start, np.ones(time.size, bool), np.zeros((time.size, 3)))
 
 
@@ -88,7 +85,7 @@ def test_the_running_sums_are_those_of_a_plain_loop() -> None:
     last = (250, 399)
     found = regressed(x, y, sd, alike, STEP, np.array(last))
     for row, k in zip(found, last, strict=True):
-        age, rows = np.exp(-(k - np.arange(k + 1)) * STEP / MEMORY), x[: k + 1]
+        age, rows = np.exp(-(k - np.arange(k + 1)) * STEP / PREDICTION.memory), x[: k + 1]
         a, b = (rows * age[:, None]).T @ rows, (rows * age[:, None]).T @ y[: k + 1]
         rest = y[: k + 1] - rows @ np.linalg.solve(a, b)
         noise = (age * rest**2).sum() / age.sum() * alike
@@ -106,7 +103,7 @@ def test_earlier_flights_count_as_if_they_had_just_been_flown() -> None:
     later_x, later_y = draw.standard_normal((50, 2)), draw.standard_normal(50)
     found = regressed(later_x, later_y, sd, 1.0, STEP, np.array([-1, 49]), before=mean)
     # the earlier rows again and again, until the memory is full of them
-    many = round(10 * MEMORY / STEP / rows) + 1
+    many = round(10 * PREDICTION.memory / STEP / rows) + 1
     flown_x, flown_y = (np.concatenate([*[old] * many, new]) for old, new in ((x, later_x), (y, later_y)))
     wanted = regressed(flown_x, flown_y, sd, 1.0, STEP, np.array([many * rows - 1, many * rows + 49]))
     assert found == pytest.approx(wanted, abs=5e-3)
@@ -125,7 +122,7 @@ def test_a_loop_that_takes_rates_back_is_learned() -> None:
     time, rate = np.arange(0.0, 40.0, STEP), np.zeros((4000, 3))
     for k in range(1, time.size):
         rate[k] = rate[k - 1] * np.exp(-STEP / 0.2) + 0.1 * draw.standard_normal(3)
-    start = np.zeros((time.size, 3, len(FEEDBACK_SD)))
+    start = np.zeros((time.size, 3, len(PREDICTION.feedback_sd)))
     start[:, :, 1] = rate
     nothing, flying = np.zeros((time.size, 3)), np.ones(time.size, bool)
     turned = Turned(time, rate, nothing, start, flying, nothing)
@@ -157,7 +154,7 @@ def test_what_is_known_at_a_start() -> None:
     assert start[:, :, 3] == pytest.approx(np.array([[2.0, -1.0, 0.0]] * 4), abs=1e-9)
     assert start[:, :, 4] == pytest.approx(np.array([[6.0, -3.0, 0.0]] * 4), abs=1e-9)
     # where it has flown to is the second and third place; what is 10 ms older counts a thousandth less
-    weight = np.exp(-0.01 / MEMORY)
+    weight = np.exp(-0.01 / PREDICTION.memory)
     mean = [place[0], place[1], *[(weight * place[1] + place[2]) / (weight + 1.0)] * 2]
     away = turned.inv().apply(place - np.array(mean))
     assert start[:, :, 5] == pytest.approx(np.column_stack([away[:, 1], -away[:, 0], np.zeros(4)]), abs=1e-9)
@@ -170,7 +167,7 @@ def test_a_mean_of_what_counts_so_far_is_that_of_a_plain_loop() -> None:
     found = remembered(value, counts, STEP)
     for row in (0, 19, 120, 299):
         use = np.flatnonzero(counts[: row + 1] & np.isfinite(value[: row + 1, 0]))
-        weight = np.exp(-(row - use) * STEP / MEMORY)
+        weight = np.exp(-(row - use) * STEP / PREDICTION.memory)
         wanted = weight @ value[use] / weight.sum() if use.size else value[row]
         assert found[row] == pytest.approx(wanted, rel=1e-9)
 
@@ -212,7 +209,8 @@ def test_a_force_that_the_model_lacks_is_the_mean_of_what_it_lacked() -> None:
     lacking[turned.time < 15.0] += 1.0  # long forgotten
     found = correction_weights(replace(turned, lacking=lacking), np.array([0.2, 0.6, 39.9]), horizon=0.5)
     assert np.array_equal(found.force[0], np.zeros(3))
-    early = lacking[:60].mean(0) / (1.0 + lacking[:60].var(0) * 10.0 / (60.0 * FORCE_SD**2))  # ten rows say the same
+    independent = 60.0 / 10.0  # rows: ten rows have one error
+    early = lacking[:60].mean(0) / (1.0 + lacking[:60].var(0) / (independent * PREDICTION.force_sd**2))
     assert found.force[1] == pytest.approx(early, rel=0.02)
     assert found.force[2] == pytest.approx([0.1, -0.2, 0.6], abs=0.12)
 
@@ -246,7 +244,7 @@ def test_between_lags_weights_are_interpolated() -> None:
 
 
 def test_a_short_flight_says_nothing() -> None:
-    turned = flight(3, seconds=LEAST_TIME, weight=0.1, offset=0.0, error=0.0)
+    turned = flight(3, seconds=PREDICTION.min_rotation_time, weight=0.1, offset=0.0, error=0.0)
     found = correction_weights(turned, turned.time[-1:], horizon=0.5)
     assert np.array_equal(found.weight, np.ones((1, 11, 3)))
 

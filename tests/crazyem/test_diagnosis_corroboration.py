@@ -20,10 +20,11 @@ from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.place import depends_on_place
 from crazyem.diagnosis.naming.answer import answer_of
-from crazyem.diagnosis.naming.corroboration import TELLING, _lag_of, false_speed, late_measurements
-from crazyem.diagnosis.naming.presence import MOST_PROBABLE, presence
+from crazyem.diagnosis.naming.corroboration import _lag_of, false_speed, late_measurements
+from crazyem.diagnosis.naming.presence import presence
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial, between, both, distinguishable, margin, scatter
 from crazyem.diagnosis.naming.unexplained import Unexplained
+from crazyem.diagnosis.settings import CONFIDENCE, SELECTION
 from crazyem.recordings.recording import Recording
 
 
@@ -83,7 +84,9 @@ def test_what_commands_say_counts_for_a_sensor_that_counts_wrong(recording: Reco
     expected = false_speed([shown], 2, scale, DRONE.motor_time_constant)
     assert expected is not None
     assert one.other_evidence == pytest.approx(expected)
-    assert one.presence(1) == pytest.approx(min(MOST_PROBABLE, expit(logit(presence(20.0, 20.0, 20.0)) + expected)))
+    assert one.presence(1) == pytest.approx(
+        min(CONFIDENCE.max_probability, expit(logit(presence(20.0, 20.0, 20.0)) + expected))
+    )
     assert replace(one, other_evidence=0.5).presence(1) == pytest.approx(expit(logit(presence(20.0, 20.0, 20.0)) + 0.5))
     assert found.steps[0].alike == ()
     assert witnessed == {"rotor_fault", "rotor_sensor"}
@@ -130,7 +133,7 @@ def test_a_flight_without_a_sudden_start_tells_a_delay_too(recording: Recording)
         data = Data([flight_of(replace(shown, signals={**shown.signals, "specific_force": slow}), DRONE)])
         said = late_measurements(data, point_of(data), 0.020)
         assert said is not None
-        assert sign * said > TELLING
+        assert sign * said > SELECTION.separating
 
 
 def test_noise_of_an_accelerometer_does_not_move_its_lag(sudden: Recording) -> None:

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from crazyem.diagnosis.fitting.gram import CHUNK, FOLDS, MANY, Gram, bounded
+from crazyem.diagnosis.fitting.gram import Gram, bounded
 from crazyem.diagnosis.naming.trials import dispersion_of
+from crazyem.diagnosis.settings import FITTING
 
 Array = NDArray[np.float64]
 
@@ -148,8 +149,8 @@ def test_columns_that_say_the_same_share_what_there_is() -> None:
 def test_held_out_is_what_the_other_folds_say_of_a_fold() -> None:
     gram = simulated(4, blocks=47, truth=np.array([0.1, 0.0, -0.1]))
     columns, total = [0, 2], 0.0
-    for fold in range(FOLDS):
-        inside = [k for k in range(47) if (k // CHUNK) % FOLDS == fold]
+    for fold in range(FITTING.folds):
+        inside = [k for k in range(47) if (k // FITTING.blocks_together) % FITTING.folds == fold]
         outside = [k for k in range(47) if k not in inside]
         b = sum(gram.score[k][columns] for k in outside)
         a = sum(gram.information[k][np.ix_(columns, columns)] for k in outside)
@@ -281,6 +282,6 @@ def test_errors_by_flights_are_those_of_parameters_that_differ_from_flight_to_fl
 
 
 def test_few_flights_do_not_tell_by_how_much_they_differ() -> None:
-    sd, freedom = differing(1, MANY - 1, 1.0).by_flights(np.zeros(2), np.zeros(2))
+    sd, freedom = differing(1, FITTING.min_flights - 1, 1.0).by_flights(np.zeros(2), np.zeros(2))
     assert freedom == 0
     assert not sd.any()

@@ -10,7 +10,8 @@ from made_flight import array_of, made_flight, without
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.diagnosis.flights.inputs import NOMINAL_VOLTAGE, inputs_of, rotor_input
+from crazyem.diagnosis.flights.inputs import inputs_of, rotor_input
+from crazyem.diagnosis.settings import RECORDINGS
 from crazyem.errors import DataError, FileFormatError
 from crazyem.physics import folding
 from crazyem.physics.rotors import wrench
@@ -58,7 +59,7 @@ def test_the_voltage_is_the_newest_and_commands_before_the_first_are_left_out() 
 
 def test_without_a_voltage_a_nominal_one_is_used_and_said() -> None:
     found = inputs_of(recording(motor_command=constant(0.6)), load_vehicle("cf2"))
-    other = rotor_input(recording(motor_command=constant(0.6), voltage=constant(NOMINAL_VOLTAGE, 1)), BOTH)
+    other = rotor_input(recording(motor_command=constant(0.6), voltage=constant(RECORDINGS.nominal_voltage, 1)), BOTH)
     assert np.allclose(found.rotor.thrust, other.thrust)
     assert np.isnan(found.rotor.voltage).all()
     assert "3.85 V is assumed" in found.notices[0]

@@ -15,8 +15,9 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import abstained
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.diagnosis.flights.inputs import NOMINAL_VOLTAGE, inputs_of
+from crazyem.diagnosis.flights.inputs import inputs_of
 from crazyem.diagnosis.prediction.predict import predict, recorded
+from crazyem.diagnosis.settings import RECORDINGS
 from crazyem.recordings.airborne import airtime
 from crazyem.vehicle import GRAVITY, load_vehicle
 
@@ -78,7 +79,7 @@ def test_where_a_flight_does_not_show_it_a_nominal_one_stays():
     ):
         found = inputs(recording, vehicle)
         assert found.level is None
-        assert f"{NOMINAL_VOLTAGE:g} V is assumed" in found.notices[0]
+        assert f"{RECORDINGS.nominal_voltage:g} V is assumed" in found.notices[0]
     assert inputs(made_flight(MOTION, noise=0.0)).level is None  # it was measured
 
 

@@ -15,7 +15,8 @@ from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.naming import select
 from crazyem.diagnosis.naming.evidence import known_of, tuning
 from crazyem.diagnosis.naming.select import group_of, may_join, name_of
-from crazyem.diagnosis.naming.trials import BEATEN, Step, Trial, better, distinguishable, preferred
+from crazyem.diagnosis.naming.trials import Step, Trial, better, distinguishable, preferred
+from crazyem.diagnosis.settings import SELECTION
 from crazyem.diagnosis.workers import Workers
 
 NOISE = np.random.default_rng(0).normal(size=40)
@@ -40,10 +41,10 @@ def test_what_is_beaten_does_not_however_simple():
     first, with a confidence of 0.02."""
     inertia, torque = trial("inertia", "xyz", 105.7), trial("torque_scale", "s", 100.0, scatter=0.25)
     assert not distinguishable(inertia, torque)  # by less than 4 nats
-    assert better(torque, inertia) < BEATEN
+    assert better(torque, inertia) < SELECTION.beaten
     assert name_of([inertia, torque], counted=False) is inertia
     unsteady = trial("torque_scale", "s", 100.0, scatter=1.0)
-    assert better(unsteady, inertia) > BEATEN
+    assert better(unsteady, inertia) > SELECTION.beaten
     assert name_of([inertia, unsteady], counted=False) is unsteady
 
 

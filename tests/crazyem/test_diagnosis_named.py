@@ -18,27 +18,17 @@ from crazyem.diagnosis.fitting.fit import Data, Fitted, bounds_of, nominal
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.fitting.nuisances import LAG_OFF, by_a_wrong_lag, nuisances, refine_base, systematic_sd
+from crazyem.diagnosis.fitting.nuisances import by_a_wrong_lag, nuisances, refine_base, systematic_sd
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.naming import answer, determined, trials
 from crazyem.diagnosis.naming.answer import _numbers, _rivals, _uncertainty, strongest_first
 from crazyem.diagnosis.naming.determined import improbable
-from crazyem.diagnosis.naming.named import DOUBTFUL, Named, one_factor, trust
-from crazyem.diagnosis.naming.presence import (
-    FREEDOM,
-    GAIN_POWER,
-    INTERCEPT,
-    LEAST_PROBABILITY,
-    MOST_PROBABLE,
-    ORDER_POWER,
-    OTHER_SD,
-    REAL_SD,
-    held_out_evidence,
-    presence,
-)
+from crazyem.diagnosis.naming.named import Named, one_factor, trust
+from crazyem.diagnosis.naming.presence import held_out_evidence, presence
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained
+from crazyem.diagnosis.settings import CONFIDENCE, FITTING
 
 OWN = np.array([1.66e-5, 1.67e-5, 2.93e-5])
 
@@ -89,8 +79,13 @@ NATS = st.floats(-100.0, 1e4)
 @given(NATS, NATS, NATS, st.floats(0.0, 1e4))
 def test_more_evidence_never_makes_a_name_less_sure(one: float, other: float, beside: float, expected: float) -> None:
     least, most = sorted((one, other))
-    assert 0.0 <= presence(least, beside, expected) <= presence(most, beside, expected) <= MOST_PROBABLE
-    assert 0.0 <= presence(beside, least, expected) <= presence(beside, most, expected) + 1e-12 <= MOST_PROBABLE + 1e-12
+    assert 0.0 <= presence(least, beside, expected) <= presence(most, beside, expected) <= CONFIDENCE.max_probability
+    assert (
+        0.0
+        <= presence(beside, least, expected)
+        <= presence(beside, most, expected) + 1e-12
+        <= CONFIDENCE.max_probability + 1e-12
+    )
 
 
 @given(NATS, st.floats(-100.0, 0.0))
@@ -113,15 +108,22 @@ def test_a_name_is_as_sure_as_what_it_brings_on_flight_held_out_and_fitted() -> 
     assert presence(0.0, 1e3, 1e3) == 0.0
     for held, expected, fitted, order in ((5.0, 20.0, 30.0, 1), (30.0, 30.0, 5.0, 2), (-8.0, 80.0, 80.0, 3)):
         density = [
-            (1.0 + (held - mean) ** 2 / (FREEDOM * variance)) ** (-0.5 * (FREEDOM + 1.0)) / math.sqrt(variance)
-            for mean, share in ((expected, REAL_SD), (0.0, OTHER_SD))
+            (1.0 + (held - mean) ** 2 / (CONFIDENCE.freedom * variance)) ** (-0.5 * (CONFIDENCE.freedom + 1.0))
+            / math.sqrt(variance)
+            for mean, share in ((expected, CONFIDENCE.real_sd), (0.0, CONFIDENCE.other_sd))
             for variance in (1.0 + 2.0 * 3.0 * expected + (share * expected) ** 2,)
         ]
-        odds = math.exp(INTERCEPT) * (1.0 + fitted) ** GAIN_POWER / order**ORDER_POWER * density[0] / density[1]
+        odds = (
+            math.exp(CONFIDENCE.intercept)
+            * (1.0 + fitted) ** CONFIDENCE.gain_power
+            / order**CONFIDENCE.order_power
+            * density[0]
+            / density[1]
+        )
         assert presence(fitted, held, expected, order, dispersion=3.0) == pytest.approx(odds / (1.0 + odds))
-    assert presence(1e9, 1e9, 1e9) == MOST_PROBABLE
-    assert improbable(0.9 * LEAST_PROBABILITY).startswith("not determined")
-    assert not improbable(1.1 * LEAST_PROBABILITY)
+    assert presence(1e9, 1e9, 1e9) == CONFIDENCE.max_probability
+    assert improbable(0.9 * CONFIDENCE.min_probability).startswith("not determined")
+    assert not improbable(1.1 * CONFIDENCE.min_probability)
 
 
 def left(nats: float, gained: float = 1e6) -> Unexplained:
@@ -142,8 +144,8 @@ def test_what_is_left_says_less_the_less_of_it_there_is_and_the_more_a_name_brin
 def test_a_name_is_sure_beside_what_it_outweighs() -> None:
     """Of 18 names that brought more than 4 times what was left 18 were right, of 70 that brought less 8."""
     for times, least, most in (
-        (-1.0, DOUBTFUL, DOUBTFUL),
-        (2.5, DOUBTFUL, DOUBTFUL),
+        (-1.0, CONFIDENCE.doubtful, CONFIDENCE.doubtful),
+        (2.5, CONFIDENCE.doubtful, CONFIDENCE.doubtful),
         (3.0, 0.5, 0.5),
         (20.0, 0.95, 1.0),
     ):
@@ -211,7 +213,7 @@ def test_inertias_are_as_unsure_as_a_lag_that_is_a_little_wrong_makes_them() -> 
     room = np.array(bounds_of([inertia, *free], fitted.point))
     low, high = np.where(np.any(room == 0.0, axis=0), 0.0, [[-np.inf], [np.inf]])  # what is at a bound stays there
     theta = []
-    for change in (0.0, LAG_OFF):
+    for change in (0.0, FITTING.lag_error):
         low[lag] = high[lag] = change
         theta.append(fitted.gram.solve(range(size), precision=fitted.precision, low=low, high=high).theta)
     for k, name in enumerate(inertia.free):

@@ -8,17 +8,10 @@ from closed_loop import turned
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis.fitting.noise import (
-    LEANING_FLOOR,
-    coloured,
-    fit_noise,
-    logs_of,
-    noise_of,
-    sample_rows,
-    without_slight,
-)
+from crazyem.diagnosis.fitting.noise import coloured, fit_noise, logs_of, noise_of, sample_rows, without_slight
 from crazyem.diagnosis.fitting.sweeps import Noise, run_sweep, scored_sweep
 from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.settings import NOISE
 from crazyem.physics.motion import RotorInput
 
 Array = NDArray[np.float64]
@@ -129,7 +122,7 @@ def test_no_attitude_made_from_an_acceleration_is_very_good() -> None:
     leaning = replace(flight, signals=flight.signals - {"attitude"})
     found, floored = (fit_noise([(f, acceleration, offset)], START).measurement[2] for f in (flight, leaning))
     assert found == pytest.approx(1e-3, rel=0.2)
-    assert floored == pytest.approx(LEANING_FLOOR)
+    assert floored == pytest.approx(NOISE.min_attitude)
 
 
 def test_long_flights_are_judged_by_stretches_all_over() -> None:

@@ -21,9 +21,9 @@ from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.locating.place import Place
 from crazyem.diagnosis.naming import accelerometer
 from crazyem.diagnosis.naming.gusts import Gusts, find_gusts
-from crazyem.diagnosis.naming.named import DOUBTFUL
 from crazyem.diagnosis.naming.other_likelihoods import other_likelihoods
 from crazyem.diagnosis.naming.unexplained import Unexplained
+from crazyem.diagnosis.settings import ACCELEROMETER, CONFIDENCE
 from crazyem.errors import DataError
 from crazyem.recordings import open_recording
 from crazyem.vehicle import load_vehicle
@@ -56,12 +56,12 @@ def test_a_tilted_accelerometer_is_measured_and_an_upright_one_is_not_accused(re
         solution, _ = accelerometer.tilt(*fitted(flown))
         sd = np.sqrt(np.diag(solution.covariance)[:2])
         assert np.all(np.abs(solution.theta[:2] - true) < 4 * sd)
-        assert np.all((sd > accelerometer.BESIDE_SCATTER) & (sd < 2e-3))
+        assert np.all((sd > ACCELEROMETER.angle_sd) & (sd < 2e-3))
         assert (solution.p_value < 1e-6) == (flown is turned)
         # thrust along z does not show the yaw: a board's few degrees, not what the residuals' scatter makes of it
         yaw, unsure = solution.theta[2], np.sqrt(solution.covariance[2, 2])
         assert abs(yaw) < 2 * unsure
-        assert 0.02 < unsure < 1.01 * accelerometer.UNSEEN_SD
+        assert 0.02 < unsure < 1.01 * ACCELEROMETER.yaw_sd
 
 
 @pytest.mark.parametrize(("roll", "told"), [(2e-3, False), (5e-3, True)])
@@ -93,7 +93,7 @@ def test_what_a_prior_says_is_no_weaker_because_residuals_scatter(recording):
     """A bias that stands for the tilt costs what its prior says, 0.5 (g angle / sd)^2, however the rest scatters."""
     axes = Rotation.from_euler("ZYX", [0.0, -0.02, 0.03]).as_matrix()
     data, point = fitted(with_values(recording, "specific_force", lambda value: value @ axes))
-    instead = 0.5 * (0.03**2 + 0.02**2) * (9.81 / accelerometer.BIAS_SD) ** 2
+    instead = 0.5 * (0.03**2 + 0.02**2) * (9.81 / ACCELEROMETER.bias_sd) ** 2
     assert instead > 60
     for model in data.models:  # from second to second, on the whole nothing
         model.flight.force[:] += 0.2 * (-1.0) ** np.floor(model.flight.time)[:, None]
@@ -140,7 +140,7 @@ def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(m
 
 
 @pytest.mark.parametrize(
-    ("nats", "confidence"), [(0.0, 0.95), (34.0, 5000.0 / 5034.0 * 0.95), (4000.0, DOUBTFUL * 0.95)]
+    ("nats", "confidence"), [(0.0, 0.95), (34.0, 5000.0 / 5034.0 * 0.95), (4000.0, CONFIDENCE.doubtful * 0.95)]
 )
 def test_gusts_are_as_sure_as_what_they_leave_allows(monkeypatch, nats, confidence):
     """Where gusts are all there is the regression explains nothing, which says nothing of them."""

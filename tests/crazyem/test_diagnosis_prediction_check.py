@@ -12,9 +12,10 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.diagnosis.naming.prediction_check import WORSE, ratio, with_found, without_what_misleads
+from crazyem.diagnosis.naming.prediction_check import ratio, with_found, without_what_misleads
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.prediction.horizon import UNITS, HorizonErrors
+from crazyem.diagnosis.settings import SELECTION
 
 INERTIA = Candidate("inertia", (), ("xx", "yy", "zz"))
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
@@ -93,5 +94,5 @@ def test_the_ratio_is_a_geometric_mean_without_the_shortest_horizon():
     assert ratio([errors(1.0), errors(1.0)], [errors(2.0), errors(0.5)]) == pytest.approx(1.0)
     assert ratio([errors(1.0), None], [errors(2.0), errors(9.0)]) == pytest.approx(2.0)
     assert ratio([None], [None]) == 1.0
-    assert ratio([errors(1.0)], [errors(np.inf)]) == np.inf > WORSE
+    assert ratio([errors(1.0)], [errors(np.inf)]) == np.inf > SELECTION.max_error_ratio
     assert ratio([errors(1.0)], [errors(np.nan)]) == 1.0

@@ -17,7 +17,8 @@ from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import prune
 from crazyem.diagnosis.naming.detection_limits import at_the_end, matters
 from crazyem.diagnosis.naming.select import shortlist, with_started
-from crazyem.diagnosis.naming.trials import LIKELY, SURE, Step, Trial, significance
+from crazyem.diagnosis.naming.trials import Step, Trial, significance
+from crazyem.diagnosis.settings import SELECTION
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.prior import Conditions
@@ -57,14 +58,14 @@ def survivors(monkeypatch, *, p_value, held, gained=50.0, held_out=True):
 @pytest.mark.parametrize(
     ("p_value", "held", "held_out", "kept"),
     [
-        (SURE / 2, 0.0, False, True),
-        (SURE / 2, 0.0, True, True),
-        (SURE * 2, 0.0, False, False),
-        (SURE * 2, 0.0, True, False),
-        (SURE * 2, 20.0, False, False),  # there is nothing held out to gain on
-        (SURE * 2, 20.0, True, True),  # by chance with exp(-20 / dispersion)
-        (SURE * 2, 1.0, True, False),
-        (LIKELY * 2, 100.0, True, False),  # too doubtful where it was fitted
+        (SELECTION.p_value / 2, 0.0, False, True),
+        (SELECTION.p_value / 2, 0.0, True, True),
+        (SELECTION.p_value * 2, 0.0, False, False),
+        (SELECTION.p_value * 2, 0.0, True, False),
+        (SELECTION.p_value * 2, 20.0, False, False),  # there is nothing held out to gain on
+        (SELECTION.p_value * 2, 20.0, True, True),  # by chance with exp(-20 / dispersion)
+        (SELECTION.p_value * 2, 1.0, True, False),
+        (SELECTION.held_out_p_value * 2, 100.0, True, False),  # too doubtful where it was fitted
     ],
 )
 def test_an_effect_that_wandering_torques_explain(monkeypatch, p_value, held, held_out, kept):
@@ -74,7 +75,7 @@ def test_an_effect_that_wandering_torques_explain(monkeypatch, p_value, held, he
 
 
 def test_where_torques_do_not_wander_nothing_is_asked(monkeypatch):
-    accepted, asked = survivors(monkeypatch, p_value=1.0, held=0.0, gained=prune.MEMORY_NATS / 2)
+    accepted, asked = survivors(monkeypatch, p_value=1.0, held=0.0, gained=SELECTION.memory_gain / 2)
     assert accepted == [DRAG]
     assert asked == []
 
@@ -97,7 +98,7 @@ def test_what_is_expected_on_flights_held_out_is_what_their_likelihood_would_los
     # 34 against 52 nats when written: bounds of what is always free and terms of second order are left out. It decides
     # between a flight that can answer and one that cannot, for which a factor of two does.
     assert wanted / 2 < found < wanted * 2
-    assert found > prune.INFORMATIVE_NATS
+    assert found > SELECTION.informative
 
 
 @pytest.mark.usefixtures("no_scatter")
@@ -294,7 +295,7 @@ def test_a_load_is_as_significant_as_its_mass():
         score -= score.mean(axis=0)
         gram = Gram(score, information, np.zeros(40, int))
         fitted = Fitted(point, (load,), 0.0, gram, np.zeros(2))
-        assert (significance(fitted, 2, offset=0) < SURE) == sure
+        assert (significance(fitted, 2, offset=0) < SELECTION.p_value) == sure
 
 
 def test_torques_and_inertias_are_fitted_together_or_not_at_all():

@@ -14,7 +14,6 @@ from crazyem.diagnosis.fitting.model import Noise, Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.random_torques import (
-    FARTHEST,
     amplitude_of,
     block_covariances,
     erratic_rotor,
@@ -26,6 +25,7 @@ from crazyem.diagnosis.locating.random_torques import (
     reach_of,
     spectrum,
 )
+from crazyem.diagnosis.settings import SPECTRUM
 
 ROWS, STEP = 2500, 0.01
 
@@ -111,7 +111,7 @@ def test_noise_has_no_hump() -> None:
     assert not peaks(model_of(np.ones((300, 3))), POINT)  # too short for a spectrum
 
 
-@pytest.mark.parametrize(("half", "wanted"), [(0.1, 0.5), (1.2, 1.2), (5.0, FARTHEST)])
+@pytest.mark.parametrize(("half", "wanted"), [(0.1, 0.5), (1.2, 1.2), (5.0, SPECTRUM.max_hump_width)])
 def test_a_hump_reaches_as_far_as_it_stands_out(half: float, wanted: float) -> None:
     """A hat of twenty times its surroundings, some hertz to either side."""
     frequency = np.arange(0.0, 50.0, 0.1)

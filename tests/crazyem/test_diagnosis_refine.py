@@ -8,11 +8,12 @@ from closed_loop import DRONE, Hidden, fly
 from scipy.optimize import minimize_scalar
 
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.fitting.fit import ENOUGH, TRIES, Data, refine
+from crazyem.diagnosis.fitting.fit import Data, refine
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Column, Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.settings import FITTING
 
 DRAG = Candidate("linear_drag", (), ("y",))
 
@@ -60,14 +61,14 @@ def test_a_fit_ends_where_a_plain_search_does_and_a_second_one_takes_no_step():
     plain = minimize_scalar(lost, bracket=(value - 0.01, value + 0.01), tol=1e-4)
     sd = 1.0 / np.sqrt(found.gram.total([0])[1][0, 0])
     assert value == pytest.approx(plain.x, abs=0.2 * sd)
-    assert found.loglik == pytest.approx(-plain.fun, abs=ENOUGH)
+    assert found.loglik == pytest.approx(-plain.fun, abs=FITTING.min_round_gain)
     data.looks = 0
     again = refine(data, found.point, [DRAG], noise=False)
     assert data.looks == 1
     assert again.point == found.point
 
 
-@pytest.mark.parametrize(("depth", "tries"), [(1e4, TRIES), (0.3, 1)])
+@pytest.mark.parametrize(("depth", "tries"), [(1e4, FITTING.tries), (0.3, 1)])
 def test_a_step_that_fails_is_tried_smaller_only_where_something_is_to_be_gained(depth: float, tries: int) -> None:
     """The step is 0.1: of 1000 nats lost a third of it may be worth a look, of 0.03 not."""
     data = Falling(depth)

@@ -11,19 +11,9 @@ from scipy.special import expit
 
 from crazyem.diagnosis import diagnose as diagnosing
 from crazyem.diagnosis.flights.inputs import inputs_of
-from crazyem.diagnosis.naming.named import DOUBTFUL
 from crazyem.diagnosis.naming.other_likelihoods import late_rotors
-from crazyem.diagnosis.naming.presence import MOST_PROBABLE
-from crazyem.diagnosis.naming.rotor_response import (
-    DELAY_SD,
-    ENOUGH,
-    Answer,
-    Response,
-    answers,
-    disobedient,
-    late_response,
-    response,
-)
+from crazyem.diagnosis.naming.rotor_response import Answer, Response, answers, disobedient, late_response, response
+from crazyem.diagnosis.settings import CONFIDENCE, ROTOR_RESPONSE, SELECTION
 from crazyem.recordings.recording import Recording
 
 NONE: Mapping[int, float] = {}
@@ -103,7 +93,7 @@ def test_what_does_not_answer_says_nothing(flown):
 
 
 def found(lag: float, delay: float, sd: float = 1.4e-3) -> Response:
-    return Response(lag, delay, np.diag([sd**2, DELAY_SD**2]))
+    return Response(lag, delay, np.diag([sd**2, ROTOR_RESPONSE.delay_sd**2]))
 
 
 def test_a_lag_or_a_delay_or_both_are_named():
@@ -126,7 +116,7 @@ def test_flights_held_out_must_agree():
     assert late_response(found(0.06, 0.0), found(0.05, 0.0), ROTORS) is None  # nearer than the file, not near
     agreed = late_response(found(0.045, 0.0), found(0.045, 0.0), ROTORS)
     assert agreed is not None
-    assert agreed.held_out > ENOUGH
+    assert agreed.held_out > SELECTION.min_evidence
 
 
 def test_where_one_is_as_good_as_the_other_both_are_said():
@@ -203,8 +193,8 @@ def test_a_late_rotor_is_as_sure_as_what_speaks_for_it(lag, held_out, deaf):
     odds = found[0].log_odds
     assert odds is not None
     most = float(expit(odds))
-    assert most <= MOST_PROBABLE
-    assert found[0].confidence == pytest.approx(min(most, DOUBTFUL) if deaf else most)
+    assert most <= CONFIDENCE.max_probability
+    assert found[0].confidence == pytest.approx(min(most, CONFIDENCE.doubtful) if deaf else most)
 
 
 @pytest.mark.slow
@@ -224,4 +214,4 @@ def test_a_diagnosis_tells_of_a_rotor_that_does_not_follow_its_command(monkeypat
     assert ("rotor 3 does not follow its command" in regimes) == sticks
     assert found.mismatch or not sticks
     # one that sticks makes them look late
-    assert [(e.name, e.confidence) for e in found.effects] == ([("motor_lag", DOUBTFUL)] if sticks else [])
+    assert [(e.name, e.confidence) for e in found.effects] == ([("motor_lag", CONFIDENCE.doubtful)] if sticks else [])

@@ -14,7 +14,8 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import nuisances
 from crazyem.diagnosis.fitting.sampling import unlogged_share
-from crazyem.diagnosis.flights.flight import SAMPLING, thinned
+from crazyem.diagnosis.flights.flight import thinned
+from crazyem.diagnosis.settings import RECORDINGS
 
 
 def values_of(time: NDArray) -> NDArray:
@@ -39,8 +40,8 @@ def test_where_samples_are_lost_no_interval_stays_empty_that_holds_one(seed: int
     there = np.random.default_rng(seed).random(500) > 0.05
     time = (period * np.arange(500))[there]
     kept, _ = thinned(time, values_of(time))
-    alone = np.diff(time) > SAMPLING  # gaps of the stream itself
-    assert np.diff(kept).max() <= 2 * SAMPLING + np.diff(time).max() * alone.any() + period
+    alone = np.diff(time) > RECORDINGS.sample_period  # gaps of the stream itself
+    assert np.diff(kept).max() <= 2 * RECORDINGS.sample_period + np.diff(time).max() * alone.any() + period
     assert set(kept) <= set(time)
 
 

@@ -21,8 +21,9 @@ from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import starting_points
 from crazyem.diagnosis.naming.select import shortlist, with_started
-from crazyem.diagnosis.naming.starting_points import KEPT, best_begun, larger, peaks
+from crazyem.diagnosis.naming.starting_points import best_begun, larger, peaks
 from crazyem.diagnosis.naming.trials import Trial
+from crazyem.diagnosis.settings import SELECTION
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 
@@ -33,7 +34,7 @@ POINT = Point(DRONE, {}, first_guess())
 @given(st.lists(st.floats(0, 1e6), min_size=1, max_size=30))
 def test_of_many_beginnings_the_highest_peaks_are_kept(gains):
     kept = peaks(gains)
-    assert 1 <= len(kept) <= KEPT
+    assert 1 <= len(kept) <= SELECTION.peaks
     assert gains[kept[0]] == max(gains)
     for i in kept:
         assert i == 0 or gains[i - 1] < gains[i]
@@ -55,7 +56,7 @@ def test_a_load_is_begun_at_the_length_whose_swing_the_flight_shows(length):
     left = best_begun(data, point, (), candidates)
     assert candidates[-1] in left  # has one beginning only
     begun = left[:-1]
-    assert 1 <= len(begun) <= KEPT
+    assert 1 <= len(begun) <= SELECTION.peaks
     fits = [fitted(data, point, c) for c in begun]
     right = [f for f in fits if f.point.effects["suspended_load"]["length"] == pytest.approx(length, rel=0.04)]
     assert len(right) == 1

@@ -22,10 +22,11 @@ from crazyem.diagnosis.naming import select as selecting
 from crazyem.diagnosis.naming import steady as steadying
 from crazyem.diagnosis.naming.detection_limits import matters
 from crazyem.diagnosis.naming.evidence import _inverse
-from crazyem.diagnosis.naming.gusts import PUSH, push_of
+from crazyem.diagnosis.naming.gusts import push_of
 from crazyem.diagnosis.naming.select import Basis, shortlist, step_of
 from crazyem.diagnosis.naming.steady import as_steady, by_onsets, with_exact_torques, without_trim_rivals
-from crazyem.diagnosis.naming.trials import SURE, SURE_DAILY, Selection, Trial, preferred, sure_enough
+from crazyem.diagnosis.naming.trials import Selection, Trial, preferred, sure_enough
+from crazyem.diagnosis.settings import SELECTION, WIND
 from crazyem.diagnosis.workers import Workers
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
@@ -182,8 +183,8 @@ def test_beside_a_trim_neither_a_weak_rotor_nor_the_place_of_a_load_is_asked_for
 
 def test_with_a_trim_in_the_file_an_effect_must_be_surer_and_a_date_pays_for_the_search() -> None:
     filed = point_of(replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}}))
-    assert SURE_DAILY < SURE
-    between = (SURE_DAILY * SURE) ** 0.5
+    assert SELECTION.daily_p_value < SELECTION.p_value
+    between = (SELECTION.daily_p_value * SELECTION.p_value) ** 0.5
     assert sure_enough(point_of(DRONE), between)
     assert not sure_enough(filed, between)
     assert by_onsets(filed, 1e-5, 20) == pytest.approx(2e-4)
@@ -216,7 +217,7 @@ def test_a_load_counts_by_what_it_differs_from_the_file(
 
 
 def test_a_drag_that_is_free_near_nothing_does_not_make_a_storm_of_a_force() -> None:
-    for drag, push in ((None, PUSH), (2e-5, PUSH), (0.012, 0.012)):
+    for drag, push in ((None, WIND.drag), (2e-5, WIND.drag), (0.012, 0.012)):
         effects = {"linear_drag": dict.fromkeys("xyz", drag)} if drag else {}
         assert push_of(point_of(DRONE, **effects)) == pytest.approx(push)
 
@@ -260,7 +261,7 @@ def test_what_wanders_is_fitted_beside_the_flights(monkeypatch) -> None:
         return refine_base(apart, *arguments, **options)
 
     monkeypatch.setattr(pruning, "refine_base", recorded)
-    monkeypatch.setattr(pruning, "MEMORY_NATS", -np.inf)
+    monkeypatch.setattr(pruning, "SELECTION", replace(SELECTION, memory_gain=-np.inf))
     step: Any = SimpleNamespace(taken=SimpleNamespace(candidate=drag, dispersion=1.0))
     pruning.without_noise_look_alikes(data, fitted, [drag], [step], None, lambda text: None)
     assert seen

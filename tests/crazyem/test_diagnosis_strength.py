@@ -12,8 +12,9 @@ from crazyem.diagnosis.fitting.days import THRUST_SD
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import OWN, Point, deviations, of_recording
 from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.fitting.nuisances import SEVERAL, differing, nuisances, refine_base
+from crazyem.diagnosis.fitting.nuisances import differing, nuisances, refine_base
 from crazyem.diagnosis.flights.flight import Flight, flight_of
+from crazyem.diagnosis.settings import FITTING
 
 STRONG = (0.97, 1.0, 1.03, 1.02)
 
@@ -73,7 +74,7 @@ def test_it_is_added_to_what_all_recordings_share_and_nothing_of_the_vehicle() -
 
 def test_it_is_free_only_among_several_recordings_of_commands() -> None:
     some = flights()
-    assert SEVERAL == 3
+    assert FITTING.min_thrust_flights == 3
     two = differing(some[:2], some[2:], DRONE)
     assert not any(f.differs for part in two for f in part)
     speeds = [replace(f, inputs=replace(f.inputs, measured=True)) for f in some]

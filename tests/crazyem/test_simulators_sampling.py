@@ -11,9 +11,8 @@ from made_flight import made_flight
 
 from benchmarks.ensemble_bands import RANDOM, randomised
 from crazyem.cli import main
-from crazyem.diagnosis.prediction.bias_correction import MEMORY
-from crazyem.diagnosis.prediction.ensemble import PRIOR_TIME, ensemble, error_scale, offset
-from crazyem.diagnosis.prediction.horizon import SPACING
+from crazyem.diagnosis.prediction.ensemble import ensemble, error_scale, offset
+from crazyem.diagnosis.settings import PREDICTION
 from crazyem.errors import DataError, FileFormatError, UsageError
 from crazyem.physics.rotations import quaternion_from_rotation_vector
 from crazyem.simulators.constants import from_vehicle
@@ -150,10 +149,12 @@ def test_the_scale_of_errors_is_of_those_known_at_a_start() -> None:
     errors[7] = np.nan
     found = error_scale(begin, end, errors, prior)
     for k in range(40):  # slow and plain
-        square, total = PRIOR_TIME * prior, PRIOR_TIME
+        square, total = PREDICTION.prior_time * prior, PREDICTION.prior_time
         for j in range(40):
             if end[j] <= begin[k] and j != 7:
-                weight = min(SPACING, begin[j + 1] - begin[j]) * np.exp((end[j] - begin[k]) / MEMORY)
+                weight = min(PREDICTION.spacing, begin[j + 1] - begin[j]) * np.exp(
+                    (end[j] - begin[k]) / PREDICTION.memory
+                )
                 square, total = square + weight * errors[j] ** 2, total + weight
         assert found[k] == pytest.approx(np.sqrt(square / total))
     later = np.where(end[:, None] > begin[20], 100.0, errors)

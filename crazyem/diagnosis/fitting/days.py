@@ -4,6 +4,7 @@ The vehicle file may give their size (`Days`, from healthy flights). Otherwise t
 from other drones.
 """
 
+from crazyem.diagnosis.settings import FITTING
 from crazyem.physics.effects.prior import Conditions
 from crazyem.physics.effects.rotors import THRUST_SCALE, TRIM
 from crazyem.vehicle import Vehicle
@@ -11,9 +12,6 @@ from crazyem.vehicle import Vehicle
 _REAL = Conditions(file_effects=frozenset({TRIM.name}))
 TRIM_SD = tuple(TRIM.prior.usual_in(_REAL).values())  # m, torque over thrust about x, y, z
 THRUST_SD = THRUST_SCALE.prior.usual_in(_REAL)["scale"]  # relative
-# Number of flights that the spread of other drones counts as. Small: the spreads of the two drones of CrazyPAD differ
-# by a factor of four.
-PRIOR_FLIGHTS = 2.0
 
 
 def trim_known(vehicle: Vehicle) -> bool:
@@ -30,4 +28,4 @@ def day_sd(vehicle: Vehicle) -> tuple[float, ...]:
 
 def day_freedom(vehicle: Vehicle) -> float:
     """Degrees of freedom of Student's t distribution of the deviations of a day."""
-    return TRIM.prior.freedom_in(_REAL) if vehicle.days is None else PRIOR_FLIGHTS + vehicle.days.flights - 1.0
+    return TRIM.prior.freedom_in(_REAL) if vehicle.days is None else FITTING.prior_flights + vehicle.days.flights - 1.0

@@ -5,23 +5,18 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.situation import initial_path, situation_of, thrust_of
 from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.settings import NOISE
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effect, Values
 from crazyem.physics.motion import motion
 from crazyem.vehicle import Vehicle
-
-OFF = 0.01  # m/s, velocity error from row to row that the test adds to the path: that of a filter
-# CHANGED: least change of the force by this error, over its varying part. It is all of it in simulated flights that
-# shake, some per cent in others. SWINGING: least varying part, over the whole force: in a hover, noise alone varies.
-CHANGED, SWINGING = 0.3, 0.2
-FEWER = 6  # one in so many of an effect's beginnings is tested
 
 
 def diverges(flight: Flight, vehicle: Vehicle, name: str) -> bool:
     """Whether a small error of the measured path changes much of an effect's force, from one of some beginnings."""
     known = initial_path(flight)
     off = known.copy()
-    off[:, 3:6] += OFF * np.random.default_rng(0).normal(size=(len(off), 3))
+    off[:, 3:6] += NOISE.chaos_velocity * np.random.default_rng(0).normal(size=(len(off), 3))
     thrusts = thrust_of(flight, vehicle, {})
     paths = [situation_of(flight, path, vehicle, thrusts) for path in (known, off)]
     free = [motion(there, vehicle=vehicle, effects={}).specific_force for there in paths]
@@ -31,20 +26,20 @@ def diverges(flight: Flight, vehicle: Vehicle, name: str) -> bool:
             for there, without in zip(paths, free, strict=True)
         )
         swing = _rms(pull - pull.mean(axis=0))
-        if swing > SWINGING * _rms(pull) and _rms(other - pull) > CHANGED * swing:
+        if swing > NOISE.chaos_swing * _rms(pull) and _rms(other - pull) > NOISE.chaos_change * swing:
             return True
     return False
 
 
 def _some(effect: Effect) -> list[Values]:
-    """Values of an effect at one in `FEWER` of its beginnings; none for an effect without sizes."""
+    """Values of an effect at one in `NOISE.chaos_every` of its beginnings; none for an effect without sizes."""
     if not effect.sizes:
         return []
     size = effect.sizes[len(effect.sizes) // 2]
     return [
         {effect.amplitude: size, name: value}
         for name, values in effect.beginnings.items()
-        for value in values[FEWER // 2 :: FEWER]
+        for value in values[NOISE.chaos_every // 2 :: NOISE.chaos_every]
     ]
 
 

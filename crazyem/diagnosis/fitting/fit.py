@@ -12,20 +12,10 @@ from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import OWN, Column, Model, Point, Swept
 from crazyem.diagnosis.fitting.noise import Informed, coloured, fit_noise, without_slight
 from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.settings import FITTING
 from crazyem.diagnosis.workers import Workers
 from crazyem.errors import DataError
 from crazyem.physics.effects.catalogue import CATALOGUE
-
-ROUNDS = 6  # most rounds of Gauss-Newton
-WILD = 4.0  # mean square of the standardised innovations of a step, beyond which the step is left out
-REACH = 2.5  # standard deviations of its prior within which a nuisance stays
-TORQUES = np.full(3, 0.5)  # rad/s^2, start values of disturbing torques with memory
-WANDER = 0.5  # s, memory of torques by moving air
-SAMPLED, WANDERING = 3.0, 2.0  # nats; nats a second: least gain by torques with the memory of the lag; of the air
-PASSES, CONVERGED = 8, 0.2  # most passes; nats between two passes, below which they have converged
-ENOUGH = 0.05  # nats; a round that gains less ends the fit
-NOTHING = 0.005  # nats; a step with a smaller expected gain (a tenth of a standard deviation) is not taken
-TRIES = 6  # most trials of a step, each a third as long as the last
 
 
 @dataclass(frozen=True)
@@ -138,9 +128,9 @@ class Data:
         if not any(strongly_shown(name, values) for name, values in point.effects.items()):
             return
         before = self.loglik(point)
-        for _ in range(PASSES):
+        for _ in range(FITTING.passes):
             now = self.loglik(point)
-            if abs(now - before) < CONVERGED:
+            if abs(now - before) < FITTING.pass_change:
                 break
             before = now
 
@@ -165,7 +155,7 @@ class Data:
             seen = swept.variance > 0
             squares = np.divide(swept.innovation**2, swept.variance, out=np.zeros_like(swept.variance), where=seen)
             mean = squares.sum(1) / np.maximum(seen.sum(1), 1)
-            limit = max(WILD, WILD * float(np.quantile(mean, 0.95)) / 2)
+            limit = max(FITTING.outlier, FITTING.outlier * float(np.quantile(mean, 0.95)) / 2)
             wild = mean > limit
             if wild.sum() > 0.02 * wild.size:
                 wild &= mean >= np.quantile(mean, 0.98)
@@ -226,9 +216,9 @@ def remembering(data: Data, point: Point) -> Point:
     seconds = sum(f.duration for f in data.flights)
     lag = 0.0 if data.flights[0].inputs.measured else point.vehicle.motor_time_constant
     best, value = point, data.loglik(point)
-    for memory, needed in ((lag, SAMPLED), (WANDER, WANDERING * seconds)):
+    for memory, needed in ((lag, FITTING.min_lag_gain), (FITTING.air_memory, FITTING.min_air_gain * seconds)):
         if memory > 0:
-            start = np.concatenate([point.noise.disturbance[:3], TORQUES])
+            start = np.concatenate([point.noise.disturbance[:3], np.full(3, FITTING.start_torque)])
             noise = replace(point.noise, disturbance=start, memory=memory)
             there = data.fit_noise(replace(point, noise=noise), near=True)
             data.settle(there)
@@ -286,9 +276,9 @@ def local_precision(away: NDArray, precision: NDArray, freedom: NDArray) -> NDAr
 def held_near(
     low: NDArray, high: NDArray, away: NDArray, precision: NDArray, freedom: NDArray | None = None
 ) -> tuple[NDArray, NDArray]:
-    """Bounds of change, where a parameter with a normal prior stays within `REACH` standard deviations: a larger
-    deviation is an effect, not a nuisance."""
-    reach = np.where(precision > 0, REACH / np.sqrt(np.maximum(precision, 1e-300)), np.inf)
+    """Bounds of change. A parameter with a normal prior stays within `FITTING.max_deviation` standard deviations: a
+    larger deviation is an effect, not a nuisance."""
+    reach = np.where(precision > 0, FITTING.max_deviation / np.sqrt(np.maximum(precision, 1e-300)), np.inf)
     if freedom is not None:
         reach = np.where(np.isinf(freedom), reach, np.inf)
     return np.maximum(low, np.minimum(-reach - away, 0.0)), np.minimum(high, np.maximum(reach - away, 0.0))
@@ -314,7 +304,7 @@ def refine(
     *,
     nuisances: Sequence[tuple[Candidate, tuple[float, ...]]] = (),
     about: Point | None = None,
-    rounds: int = ROUNDS,
+    rounds: int = FITTING.rounds,
     noise: bool = True,
 ) -> Fitted:
     """Maximum of the posterior near `start`, a model that contains the effects of the candidates.
@@ -349,13 +339,13 @@ def refine(
         local = local_precision(away(point), weight, freedom)
         best = gram.solve(range(gram.size), low=low, high=high, precision=local, prior=-away(point))
         before = value
-        for k in range(TRIES if best.gain > NOTHING else 0):
+        for k in range(FITTING.tries if best.gain > FITTING.min_step_gain else 0):
             there = moved(point, free, best.theta / 3**k)
             found, slopes = look(there)
             if found > value - 1e-6:
                 point, value, gram = there, found, slopes
                 break
-            if found > value - ENOUGH:  # a smaller step would gain too little, too
+            if found > value - FITTING.min_round_gain:  # a smaller step would gain too little, too
                 break
         gained = value - before
         if noise and (turn < 1 or gained > 2.0):
@@ -363,7 +353,7 @@ def refine(
             found, slopes = look(better)
             if found > value:
                 point, value, gram = better, found, slopes
-        if gained < ENOUGH:
+        if gained < FITTING.min_round_gain:
             break
     precision = local_precision(away(point), weight, freedom)
     return Fitted(point, tuple(candidates), value, gram, precision, tuple(c for c, _ in nuisances))

@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-FOLDS = 5
-CHUNK = 3  # blocks that stay together in a fold
-MANY = 5  # least number of flights from which a scatter between flights is computed
+from crazyem.diagnosis.settings import FITTING
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,7 @@ class Gram:
     def fold_of(self) -> NDArray:
         """(b,) fold of each block: chunks of blocks dealt out in turn."""
         index = np.arange(self.score.shape[0])
-        return (index // CHUNK) % FOLDS
+        return (index // FITTING.blocks_together) % FITTING.folds
 
     def total(self, columns: Sequence[int]) -> tuple[NDArray, NDArray]:
         """Sums over all blocks: (k,), (k, k)."""
@@ -92,7 +90,7 @@ class Gram:
         gain = float(b @ theta - 0.5 * theta @ a @ theta - 0.5 * weight @ (theta - centre) ** 2)
         gain += float(0.5 * weight @ centre**2)
         fold, held = self.fold_of(), 0.0
-        for f in range(FOLDS):
+        for f in range(FITTING.folds):
             out = fold == f
             if not out.any() or out.all():
                 continue
@@ -116,14 +114,14 @@ class Gram:
         """Standard deviations (c,) of all columns from the scatter of the scores of flights, and degrees of freedom.
 
         Some errors are the same in all blocks of a flight (clock, battery, air), so the scatter of blocks does not show
-        them (the sandwich by clusters; Liang and Zeger, Biometrika 73, 1986). 0 for fewer flights than `MANY`.
+        them (the sandwich by clusters; Liang and Zeger, Biometrika 73, 1986). 0 for fewer than `FITTING.min_flights`.
 
         Args:
             theta: (c,) change of the parameters to the maximum.
             precision: (c,) of Gaussian priors.
         """
         which, of_flight = np.unique(self.flight, return_inverse=True)
-        if which.size < MANY:
+        if which.size < FITTING.min_flights:
             return np.zeros(self.size), 0
         residual = self.score - self.information @ theta
         scores = np.zeros((which.size, self.size))

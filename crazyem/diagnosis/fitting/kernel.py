@@ -22,9 +22,9 @@ from crazyem.vehicle import GRAVITY
 STATES = 30
 MEASURED = 12  # measured scalars
 DISTURBED = 6  # disturbances; they and the errors are the states with memory
-# Rows of inner loops have a length that is a multiple of LANES, and at least LEAST. A rest that does not fill a vector
-# register would take three times as long.
-LANES, LEAST = 4, 16
+# Rows of inner loops have a length that is a multiple of LANES, and at least SHORTEST_ROW. A rest that does not fill a
+# vector register would take three times as long.
+LANES, SHORTEST_ROW = 4, 16
 # Limits of the number of measurements whose products are added by one product of matrices; with more, BLAS would use
 # several threads.
 PRODUCT, MOST_ROWS = 200_000, 600
@@ -119,7 +119,7 @@ def _take_away(x, scale, left, right):
 @compiled
 def _padded(size):
     """Length of a row for `size` numbers (see `LANES`)."""
-    return max(LEAST, (size + LANES - 1) // LANES * LANES)
+    return max(SHORTEST_ROW, (size + LANES - 1) // LANES * LANES)
 
 
 @compiled

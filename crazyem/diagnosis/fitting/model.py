@@ -21,14 +21,13 @@ from crazyem.diagnosis.fitting.situation import (
 )
 from crazyem.diagnosis.fitting.sweeps import Noise, Swept, run_sweep
 from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.settings import NOISE
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effects, Situation
 from crazyem.physics.motion import measured, motion
 from crazyem.vehicle import Vehicle
 
-LATERAL = 0.05  # least share of the force along x and y in a column, for which onboard estimates depend on the column
-RECENT = 0.5  # s, averaging time of the acceleration that a model lacks: much longer than a sample, to average noise
 # Prefix of the deviations of single recordings: "own:gyro_bias" -> {"FLIGHT/x": deviation}, added to the shared value
 # of the effect. Batteries and sensors change from day to day.
 OWN = "own:"
@@ -94,12 +93,12 @@ def unrest(noise: Noise) -> NDArray:
 def lacking(impulse: NDArray, step: NDArray, known: NDArray) -> NDArray:
     """(n, 6) specific force m/s^2 and angular acceleration rad/s^2, body axes, that a model lacks along a flight.
 
-    The mean over the last `RECENT` of disturbances with memory and of corrections by measurements (both in
+    The mean over the last `NOISE.averaging` of disturbances with memory and of corrections by measurements (both in
     `corrected`). The filter sees faster changes too late; they would look like a gyro that is early.
     """
-    forget = [1.0, -np.exp(-float(np.median(step[known])) / RECENT)] if known.any() else [1.0, 0.0]
+    forget = [1.0, -np.exp(-float(np.median(step[known])) / NOISE.averaging)] if known.any() else [1.0, 0.0]
     total, span = (lfilter([1.0], forget, v, axis=0) for v in (impulse, step[:, None]))
-    mean: NDArray = total / np.maximum(span, RECENT)
+    mean: NDArray = total / np.maximum(span, NOISE.averaging)
     return mean
 
 
@@ -331,7 +330,7 @@ class Model:
 
     def _shown_by(self, point: Point, change: NDArray, acceleration: NDArray) -> NDArray | None:
         """(n, 12) change of the offsets by a change of accelerations (n, 6), through the force; None: 0."""
-        if not self.flight.fused or np.linalg.norm(change[:, :2]) < LATERAL * np.linalg.norm(change):
+        if not self.flight.fused or np.linalg.norm(change[:, :2]) < NOISE.min_lateral * np.linalg.norm(change):
             return None
         here = of_recording(point.effects, self.flight.name)
         effects = {name: here[name] for name in here if CATALOGUE[name].uses_force}

@@ -12,34 +12,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.sweeps import Noise, Swept, run_sweep, scored_sweep
-from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.flights.flight import COLUMNS, Flight
+from crazyem.diagnosis.settings import NOISE
 from crazyem.diagnosis.workers import Workers
 
-ROWS = 1500  # rows of each flight, in a few stretches, for the fit of the scales
-STRETCH = 750  # rows of a stretch; with many short ones, the filter starts often and velocities seem too accurate
-FEW, SHORT = 900, 150  # the same for the first, rough fit
-PRIOR_SD = 2.0  # standard deviation of the logarithm of a scale about its typical value
-MOST_STEPS = 40
-FIRST = (0, 3, 6, 10)  # first columns of position, velocity, attitude and body rate in `Flight.y`
-STEP = 0.02  # of the logarithm, for differences
-LARGEST = 1.5  # largest step of the logarithm in scoring
-# s, typical correlation times of errors. Position fixes correct an onboard estimate within some 0.04 s. Markers and
-# calibration of motion capture are wrong for longer. The gyro has a low pass of 80 Hz.
-RECALL, RECALL_SD = np.array([0.06, 0.06, 0.06, 2.5e-3]), np.array([1.0, 1.0, 1.0, 0.3])  # sd: of the logarithm
-SHORT_MEMORY = 3.0  # sampling period in correlation times, from which an error is white
-SLIGHT = 0.6  # least root spectral density of an error with memory, over that of the white error
-TYPICAL = Noise(
-    np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]), np.array([1e-3, 1e-2, 3e-3, 1e-2]),
-    np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]), coloured=np.array([1e-3, 1e-2, 3e-3, 1e-2]), recall=RECALL,
-)  # fmt: skip
-LEAST = Noise(
-    np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2]), np.array([1e-5, 1e-4, 1e-4, 1e-4]),
-    np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3]), coloured=np.array([1e-5, 1e-4, 1e-4, 1e-4]), recall=0.2 * RECALL,
-)  # fmt: skip
-WIDTH = np.append(np.full(20, PRIOR_SD), RECALL_SD)  # standard deviations of the logarithms about typical ones
-# rad, least error of an attitude that is inferred from an acceleration; quiet flights have 4 to 5 mrad. With 0.5 mrad,
-# noise of the acceleration would look like torques, and would hide a steady torque (a weak rotor).
-LEANING_FLOOR = 3e-3
+FIRST = tuple(c.start for c in COLUMNS.values())  # first columns of the signals in `Flight.y`
+RECALL = np.array(NOISE.recall)
+
+
+def _scales(
+    impulse: Sequence[float], measurement: Sequence[float], disturbance: Sequence[float], recall: NDArray
+) -> Noise:
+    """Noise that is alike in all axes; coloured errors as large as those of measurements."""
+    disturbances = np.repeat(disturbance, 3)
+    errors = np.array(measurement)
+    return Noise(np.repeat(impulse, 3), errors, disturbances, coloured=errors, recall=recall)
+
+
+TYPICAL = _scales(NOISE.impulse, NOISE.measurement, NOISE.disturbance, RECALL)
+SMALLEST = _scales(NOISE.min_impulse, NOISE.min_measurement, NOISE.min_disturbance, NOISE.min_recall * RECALL)
+LOG_SD = np.append(np.full(20, NOISE.log_sd), NOISE.log_recall_sd)  # of all scales about typical ones
 
 
 def logs_of(noise: Noise) -> NDArray:
@@ -63,7 +55,7 @@ def coloured(noise: Noise, flights: Sequence[Flight]) -> Noise:
     the velocity.
     """
     periods = np.array([_period(flights, c) for c in FIRST])
-    lasting = periods < SHORT_MEMORY * RECALL
+    lasting = periods < NOISE.white_period * RECALL
     lasting[:2] &= not np.isfinite(periods[:2]).all()
     return replace(noise, coloured=np.where(lasting, noise.measurement, 0.0), recall=RECALL.copy())
 
@@ -72,7 +64,7 @@ def without_slight(noise: Noise, flights: Sequence[Flight]) -> Noise:
     """The noise without coloured errors that are negligible at all frequencies: each costs time in every pass."""
     periods = np.array([_period(flights, c) for c in FIRST])
     density = noise.coloured * np.sqrt(1.0 + 2.0 * noise.recall / periods)
-    return replace(noise, coloured=np.where(density < SLIGHT * noise.measurement, 0.0, noise.coloured))
+    return replace(noise, coloured=np.where(density < NOISE.min_coloured * noise.measurement, 0.0, noise.coloured))
 
 
 def _period(flights: Sequence[Flight], column: int) -> float:
@@ -81,7 +73,7 @@ def _period(flights: Sequence[Flight], column: int) -> float:
     return min((float(np.median(np.diff(t))) for t in times if t.size > 1), default=np.inf)
 
 
-def sample_rows(flight: Flight, *, rows: int = ROWS, stretch: int = STRETCH) -> NDArray:
+def sample_rows(flight: Flight, *, rows: int = NOISE.rows, stretch: int = NOISE.stretch) -> NDArray:
     """(n,) bool: stretches spread over the flight, for the fit of the noise."""
     n = flight.time.size
     if n <= rows:
@@ -126,10 +118,14 @@ def fit_noise(
     is `near`, a rough fit to few rows comes first.
     """
     workers, informed = workers or Workers(1), informed or Informed()
-    if not near and any(f.time.size > FEW for f, _, _ in parts):
-        few = [(f.rows(k), a[k], o[k]) for f, a, o in parts for k in (sample_rows(f, rows=FEW, stretch=SHORT),)]
+    if not near and any(f.time.size > NOISE.rough_rows for f, _, _ in parts):
+        few = [
+            (f.rows(k), a[k], o[k])
+            for f, a, o in parts
+            for k in (sample_rows(f, rows=NOISE.rough_rows, stretch=NOISE.rough_stretch),)
+        ]
         start = _scored(few, start, 5 * tolerance, workers, Informed())
-    chosen = [(f.rows(keep), a[keep], o[keep]) for f, a, o in parts for keep in (sample_rows(f, rows=ROWS),)]
+    chosen = [(f.rows(keep), a[keep], o[keep]) for f, a, o in parts for keep in (sample_rows(f, rows=NOISE.rows),)]
     return _scored(chosen, start, tolerance, workers, informed)
 
 
@@ -139,12 +135,12 @@ def _scored(chosen: list[Part], start: Noise, tolerance: float, workers: Workers
         measured |= np.array([np.isfinite(flight.y[:, c]).any() for c in FIRST])
     lasting = measured & (start.coloured > 0)
     free = np.concatenate([np.ones(6, bool), measured, start.disturbance > 0, lasting, lasting])
-    logs, memory, floor = logs_of(start), start.memory, logs_of(LEAST)
+    logs, memory, floor = logs_of(start), start.memory, logs_of(SMALLEST)
     if any("attitude" not in f.signals and np.isfinite(f.y[:, 6]).any() for f, _, _ in chosen):
-        floor[8] = np.log(LEANING_FLOOR)
+        floor[8] = np.log(NOISE.min_attitude)
     logs = np.maximum(logs, np.where(free, floor, -np.inf))
     typical, index = logs_of(TYPICAL), np.flatnonzero(free)
-    weight = WIDTH[index] ** -2.0
+    weight = LOG_SD[index] ** -2.0
     key = (*(f.time.size for f, _, _ in chosen), *index.tolist(), *np.atleast_1d(memory).tolist())
 
     def look(at: NDArray) -> tuple[float, NDArray, list[Swept]]:
@@ -156,13 +152,13 @@ def _scored(chosen: list[Part], start: Noise, tolerance: float, workers: Workers
         return value, slope, [swept for swept, _ in found]
 
     value, score, swept = look(logs)
-    for _ in range(MOST_STEPS):
+    for _ in range(NOISE.max_steps):
         fresh = key not in informed.known
         if fresh:
             information = _information(chosen, swept, logs, memory, index, workers)
             informed.known[key] = information + np.diag(weight)
         curvature = informed.known[key]
-        step = np.clip(np.linalg.solve(curvature, score), -LARGEST, LARGEST)
+        step = np.clip(np.linalg.solve(curvature, score), -NOISE.max_log_step, NOISE.max_log_step)
         for _ in range(5):
             there = logs.copy()
             there[index] = np.maximum(logs[index] + step, floor[index])
@@ -204,12 +200,12 @@ def _information(
             for f, a, o in chosen
         ]
 
-    moved = workers.map(sweep, logs + STEP * np.eye(logs.size)[index])
+    moved = workers.map(sweep, logs + NOISE.log_step * np.eye(logs.size)[index])
     information = np.zeros((index.size, index.size))
     for part, base in enumerate(here):
         seen = base.variance > 0
         s, e = base.variance[seen], base.innovation[seen]
-        ds = np.stack([(m[part].variance[seen] - s) / STEP for m in moved]) / s
-        de = np.stack([(m[part].innovation[seen] - e) / STEP for m in moved]) / np.sqrt(s)
+        ds = np.stack([(m[part].variance[seen] - s) / NOISE.log_step for m in moved]) / s
+        de = np.stack([(m[part].innovation[seen] - e) / NOISE.log_step for m in moved]) / np.sqrt(s)
         information += 0.5 * ds @ ds.T + de @ de.T
     return information

@@ -14,16 +14,13 @@ from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, bounds_of
 from crazyem.diagnosis.fitting.gram import Solution, used
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.settings import FITTING
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effect
 from crazyem.physics.effects.prior import Prior
 from crazyem.physics.effects.timing import MOTOR_LAG
 from crazyem.vehicle import Vehicle
 
-# s, rms error of a fitted rotor lag, of sixteen flights without a missing effect (47 to 55 ms fitted). Where the drone
-# turns little, each ms too much makes the inertias 3 % too small.
-LAG_OFF = 3e-3
-SEVERAL = 3  # least number of recordings with known commands for which each gets a thrust scale of its own
 COARSE_REASON = "the turning does not follow the commands as they were recorded: they are on another clock"
 TRIM_REASON = "a shifted centre of mass is a trim, and that changes from day to day"
 LEVEL_REASON = "no battery voltage is recorded, so how heavy or strong the drone is cannot be told"
@@ -57,13 +54,13 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
 
 
 def differing(flights: Sequence[Flight], kept_apart: Sequence[Flight], vehicle: Vehicle) -> list[list[Flight]]:
-    """The flights, each with a thrust scale of its own if there are enough of them (`SEVERAL`).
+    """The flights, each with a thrust scale of its own if there are enough of them (`FITTING.min_thrust_flights`).
 
     A vehicle file with a trim already has such a free thrust. So does a voltage from the start of the flight
     (`level.py`).
     """
     commanded = not any(f.inputs.measured or f.levelled for f in (*flights, *kept_apart))
-    own = len(flights) >= SEVERAL and commanded and TRIM not in vehicle.effects
+    own = len(flights) >= FITTING.min_thrust_flights and commanded and TRIM not in vehicle.effects
     return [[replace(f, differs=own) for f in part] for part in (flights, kept_apart)]
 
 
@@ -189,7 +186,7 @@ def systematic_sd(data: Data, point: Point) -> dict[tuple[str, str], float]:
 
 
 def by_a_wrong_lag(data: Data, fitted: Fitted) -> dict[tuple[str, str], float]:
-    """(effect, parameter) -> error that an error `LAG_OFF` of the rotor lag causes.
+    """(effect, parameter) -> error that an error `FITTING.lag_error` of the rotor lag causes.
 
     For effects with twins (`Effect.twins`), if the lag is a nuisance.
     """
@@ -205,7 +202,7 @@ def by_a_wrong_lag(data: Data, fitted: Fitted) -> dict[tuple[str, str], float]:
     a = fitted.gram.total(range(len(names)))[1] + np.diag(fitted.precision)
     scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
     along = np.linalg.lstsq((a / np.outer(scale, scale))[np.ix_(others, others)], a[others, at] / scale[others])[0]
-    moved = dict(zip((names[i] for i in others), np.abs(along / scale[others]) * LAG_OFF, strict=True))
+    moved = dict(zip((names[i] for i in others), np.abs(along / scale[others]) * FITTING.lag_error, strict=True))
     return {name: float(moved[name]) for name in own if CATALOGUE[name[0]].twins and name in moved}
 
 

@@ -10,23 +10,16 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import TRIM
 from crazyem.diagnosis.fitting.days import TRIM_SD
 from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.settings import FITTING, RECORDINGS
 from crazyem.physics.effects.timing import LOOP
 from crazyem.physics.rotors import wrench
 from crazyem.vehicle import Vehicle
 
-# A loop at 500 Hz answers to vibration. Its commands, logged at 100 Hz, are nearly white: a logged command acts for
-# 2 ms only, and most commands are not logged. The effect `sampled_commands` models the white part. The rest is an error
-# in the input, by which a fit makes the drone look heavy and damped.
-# Least share of power above half of the Nyquist frequency, of roll and pitch torques of real drones (white: 0.5):
-COARSE = 0.2  # flights of the simulated firmware have up to 0.12; real flights and those of RotorPy have more
-NEGLIGIBLE = 1e-3  # relative error of torques: a tenth of the uncertainty of inertias (`mass_properties._moments`)
-EDGE, SLOW = 0.5, 1.0  # s left out at both ends; Hz, lower frequencies of torques are left out
-
 
 def shaken_commands(flights: Sequence[Flight], vehicle: Vehicle) -> bool:
-    """Whether the commands of most flights are faster than their sampling (see `COARSE`)."""
+    """Whether the commands of most flights are faster than their sampling (see `FITTING.coarse_share`)."""
     shares = [fast_share(f, vehicle) for f in flights if not f.inputs.measured]
-    return bool(shares) and float(np.median(shares)) > COARSE
+    return bool(shares) and float(np.median(shares)) > FITTING.coarse_share
 
 
 def unlogged_share(flights: Sequence[Flight], vehicle: Vehicle) -> float:
@@ -41,7 +34,7 @@ def unlogged_share(flights: Sequence[Flight], vehicle: Vehicle) -> float:
         if not flight.inputs.measured:
             missed = max(0.0, 1.0 - LOOP / interval(flight))
             shares.append(min(1.0, 4.0 * missed * fast_share(flight, vehicle) ** 2))
-    return max(shares) if max(shares) > NEGLIGIBLE else 0.0
+    return max(shares) if max(shares) > FITTING.min_sampled_torque else 0.0
 
 
 def interval(flight: Flight) -> float:
@@ -78,7 +71,7 @@ def fast_share(flight: Flight, vehicle: Vehicle) -> float:
 @lru_cache(maxsize=64)
 def _fast_share(flight: Flight, arm: tuple[float, float], torque_per_thrust: float) -> float:
     time = flight.inputs.time
-    inside = (time > flight.time[0] + EDGE) & (time < flight.time[-1] - EDGE)
+    inside = (time > flight.time[0] + RECORDINGS.edge) & (time < flight.time[-1] - RECORDINGS.edge)
     if inside.sum() < 100:
         return 0.0
     period = interval(flight)
@@ -88,5 +81,8 @@ def _fast_share(flight: Flight, arm: tuple[float, float], torque_per_thrust: flo
     window = np.hanning(grid.size)
     power = np.abs(np.fft.rfft((even - even.mean(axis=1, keepdims=True)) * window)) ** 2
     frequency = np.fft.rfftfreq(grid.size, period)
-    fast, all_of_it = power[:, frequency > 0.25 / period].sum(1), power[:, frequency > SLOW].sum(1)
+    fast, all_of_it = (
+        power[:, frequency > 0.25 / period].sum(1),
+        power[:, frequency > FITTING.min_torque_frequency].sum(1),
+    )
     return float(np.divide(fast, all_of_it, out=np.zeros(2), where=all_of_it > 0).max())

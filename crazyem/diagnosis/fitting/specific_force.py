@@ -10,10 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights.flight import Flight
-
-SMOOTH = 0.2  # s; slower changes are motion, faster ones vibration
-LEAST = 0.05  # m/s^2, least vibration and resolution of an accelerometer on a flying drone
-WILD = 6.0  # standard deviations at which residuals are clipped
+from crazyem.diagnosis.settings import NOISE
 
 
 def is_needed(flight: Flight) -> bool:
@@ -25,11 +22,11 @@ def is_needed(flight: Flight) -> bool:
 def vibration(flight: Flight, model: NDArray) -> NDArray:
     """(3,) standard deviation [m/s^2] of the vibration, from the difference to a model (n, 3)."""
     period = float(np.median(np.diff(flight.time)))
-    width = max(3, round(SMOOTH / period))
+    width = max(3, round(NOISE.vibration_period / period))
     kernel = np.ones(width) / width
     rest = np.where(np.isfinite(flight.force), flight.force, model) - model
     found = np.array([1.4826 * np.median(np.abs(c - np.convolve(c, kernel, "same"))) for c in rest.T])
-    return np.maximum(found, LEAST)
+    return np.maximum(found, NOISE.min_vibration)
 
 
 def evidence(
@@ -48,12 +45,12 @@ def evidence(
     measured[1:] = 0.5 * (flight.force[1:] + flight.force[:-1])
     standard = (measured - model - bias) / noise
     usable = np.isfinite(standard).all(axis=1) & ~flight.starts
-    z = np.where(usable[:, None], np.clip(standard, -WILD, WILD), 0.0)
+    z = np.where(usable[:, None], np.clip(standard, -NOISE.max_force_residual, NOISE.max_force_residual), 0.0)
     loglik = -0.5 * float(np.sum(z**2)) - float(usable.sum() * np.log(2 * np.pi * noise**2).sum() / 2)
     count, columns = flight.blocks, acting.shape[2]
     score, information = np.zeros((count, columns)), np.zeros((count, columns, columns))
     if columns:
-        inner = usable[:, None] & (np.abs(standard) < WILD)
+        inner = usable[:, None] & (np.abs(standard) < NOISE.max_force_residual)
         slopes = np.where(inner[:, :, None], acting / noise[:, None], 0.0)
         first = np.concatenate([[0], np.flatnonzero(np.diff(flight.block)) + 1, [flight.block.size]])
         for b in range(count):

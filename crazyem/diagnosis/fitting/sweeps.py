@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.kernel import layout, sweep
 from crazyem.diagnosis.fitting.noise_score import noise_score
 from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.settings import NOISE
 
-WIDE = np.array([1.0] * 3 + [2.0] * 3 + [0.5] * 3 + [3.0] * 3) ** 2  # variances at a start of unmeasured states
+WIDE = np.repeat(np.square(NOISE.start_sd), 3)  # variances at a start of unmeasured states
 
 
 @dataclass(frozen=True)

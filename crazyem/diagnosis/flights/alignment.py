@@ -16,19 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights import band_delay as band
+from crazyem.diagnosis.settings import CLOCKS, RECORDINGS
 from crazyem.physics.rotors import PITCH_SIGN, ROLL_SIGN
 from crazyem.recordings.airborne import Airtime
 from crazyem.recordings.ordering import inside, ordered
 from crazyem.recordings.recording import Recording
-
-REACH = 0.15  # s, largest delay of either sign
-SURE = 4e-3  # s, largest standard error of a delay that is used
-AGREE = 6e-3  # s, largest difference of roll and pitch, beside three standard errors
-EXPLAINED = 0.1  # least share of the variance of the acceleration that the rotors explain
-PRIOR = 0.01  # s, standard deviation of delays before the flight
-# Least unexplained power of the acceleration in a block with a collision, over that of the median block (172 at most in
-# 23 files of real flights, 2652 in a crash). Such a block would outweigh the flight.
-BLOW = 300.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +72,8 @@ def align(recording: Recording, thrust_time: NDArray, thrust: NDArray, flight: A
     thrust_time, thrust = _fresh(thrust_time, thrust)
     if when.size < 100 or thrust_time.size < 100:
         return None
-    time = np.arange(max(when[0], thrust_time[0]), min(when[-1], thrust_time[-1]), band.GRID)
-    if time.size < band.FEWEST_BLOCKS * band.BLOCK / band.GRID:
+    time = np.arange(max(when[0], thrust_time[0]), min(when[-1], thrust_time[-1]), CLOCKS.grid)
+    if time.size < CLOCKS.min_blocks * RECORDINGS.block / CLOCKS.grid:
         return None
     rates = band.on_grid(time, when, rate[:, :2])
     torque = band.on_grid(time, thrust_time, np.stack([thrust @ ROLL_SIGN, thrust @ PITCH_SIGN], 1))
@@ -91,17 +83,17 @@ def align(recording: Recording, thrust_time: NDArray, thrust: NDArray, flight: A
         if t.size > 2:
             speed = band.band_passed(band.on_grid(time, t, v))
             beside += [speed[:, [0]].repeat(2, 1), speed[:, [1]].repeat(2, 1)]
-    acceleration = band.band_passed(np.gradient(rates, band.GRID, axis=0))
+    acceleration = band.band_passed(np.gradient(rates, CLOCKS.grid, axis=0))
     shaken = band.band_passed(torque)
-    margin = round((REACH + band.SUPPORT) / band.GRID)
+    margin = round((CLOCKS.max_delay + CLOCKS.filter_half) / CLOCKS.grid)
     good = inside(time, flight.flown)
     good &= (band.spacing(time, when) < 0.04) & (band.spacing(time, thrust_time) < 0.04)
     good[:margin], good[len(good) - margin :] = False, False
     index = np.flatnonzero(good)
-    if index.size * band.GRID < band.FEWEST_BLOCKS * band.BLOCK:
+    if index.size * CLOCKS.grid < CLOCKS.min_blocks * RECORDINGS.block:
         return None
-    block = np.unique(((time[index] - time[0]) / band.BLOCK).astype(int), return_inverse=True)[1]
-    delays = band.delays_within(REACH)
+    block = np.unique(((time[index] - time[0]) / RECORDINGS.block).astype(int), return_inverse=True)[1]
+    delays = band.delays_within(CLOCKS.max_delay)
     sums = np.stack([band.products(index, block, acceleration, shaken, beside, d) for d in delays], 2)
     return _accepted(delays, sums, time[index], block)
 
@@ -125,26 +117,28 @@ def _unhit(delays: NDArray, sums: NDArray) -> NDArray:
         weights = np.append(-np.linalg.solve(a[:-1, :-1], a[:-1, -1]) * scale[-1] / scale[:-1], 1.0)
         left[axis] = np.einsum("i,bij,j->b", weights, sums[axis, :, at], weights)
     usual = np.median(left, axis=1, keepdims=True)
-    kept: NDArray = sums[:, np.all(left <= BLOW * np.maximum(usual, 1e-300), axis=0)]
+    kept: NDArray = sums[:, np.all(left <= CLOCKS.collision * np.maximum(usual, 1e-300), axis=0)]
     return kept
 
 
 def _accepted(delays: NDArray, sums: NDArray, time: NDArray, block: NDArray) -> Alignment | None:
     count = sums.shape[1]
-    if count < band.FEWEST_BLOCKS:
+    if count < CLOCKS.min_blocks:
         return None
     unhit = _unhit(delays, sums)
     total = unhit.sum(1)
     delay, explained = band.delay_of(delays, total)
     roll, pitch = (band.peak(delays, band.explained_share(total[i])) for i in range(2))
     sd = band.standard_error(delays, unhit, total)
-    determined = np.isfinite([delay, roll, pitch]).all() and explained > EXPLAINED and sd < SURE
-    if not determined or abs(roll - pitch) > AGREE + 3 * sd:
+    determined = (
+        np.isfinite([delay, roll, pitch]).all() and explained > CLOCKS.min_explained and sd < CLOCKS.max_delay_sd
+    )
+    if not determined or abs(roll - pitch) > CLOCKS.axis_difference + 3 * sd:
         return None
-    ends = np.array([time[block == b][-1] for b in range(count)]) + band.SUPPORT + REACH
+    ends = np.array([time[block == b][-1] for b in range(count)]) + CLOCKS.filter_half + CLOCKS.max_delay
     running = np.zeros(count)
-    looked_at = set(np.unique(np.geomspace(band.FEWEST_BLOCKS, count, 16).astype(int) - 1).tolist())
-    for b in range(band.FEWEST_BLOCKS - 1, count):
+    looked_at = set(np.unique(np.geomspace(CLOCKS.min_blocks, count, 16).astype(int) - 1).tolist())
+    for b in range(CLOCKS.min_blocks - 1, count):
         if b not in looked_at:
             running[b] = running[b - 1]
             continue
@@ -153,5 +147,5 @@ def _accepted(delays: NDArray, sums: NDArray, time: NDArray, block: NDArray) -> 
         found, _ = band.delay_of(delays, before)
         error = band.standard_error(delays, until, before)
         sound = np.isfinite(found) and np.isfinite(error)
-        running[b] = found * PRIOR**2 / (PRIOR**2 + error**2) if sound else running[b - 1]
+        running[b] = found * CLOCKS.delay_sd**2 / (CLOCKS.delay_sd**2 + error**2) if sound else running[b - 1]
     return Alignment(delay, sd, roll, pitch, explained, ends, running)

@@ -7,17 +7,12 @@ delay. Sums are kept by blocks of flight, so that a jackknife gives the standard
 import numpy as np
 from numpy.typing import NDArray
 
-STEP = 2.5e-3  # s between tried delays
-GRID = 5e-3  # s between rows
-BLOCK = 1.0  # s
-BAND = (0.015, 0.1)  # s, widths of the Gaussians whose difference is the band: about 1.5 to 10 Hz
-SUPPORT = 0.3  # s, half the length of the filter of the band
-FEWEST_BLOCKS = 4
+from crazyem.diagnosis.settings import CLOCKS
 
 
 def delays_within(reach: float) -> NDArray:
     """(d,) s: delays to try, up to `reach` [s] on either side."""
-    return np.arange(-reach, reach + STEP / 2, STEP)
+    return np.arange(-reach, reach + CLOCKS.step / 2, CLOCKS.step)
 
 
 def on_grid(time: NDArray, when: NDArray, value: NDArray) -> NDArray:
@@ -33,8 +28,8 @@ def spacing(time: NDArray, when: NDArray) -> NDArray:
 
 def _kernel() -> NDArray:
     """A difference of Gaussians of zero sum, of finite length."""
-    t = np.arange(-round(SUPPORT / GRID), round(SUPPORT / GRID) + 1) * GRID
-    narrow, wide = (np.exp(-0.5 * np.square(t / width)) for width in BAND)
+    t = np.arange(-round(CLOCKS.filter_half / CLOCKS.grid), round(CLOCKS.filter_half / CLOCKS.grid) + 1) * CLOCKS.grid
+    narrow, wide = (np.exp(-0.5 * np.square(t / width)) for width in CLOCKS.band)
     return narrow / narrow.sum() - wide / wide.sum()
 
 
@@ -53,7 +48,7 @@ def products(
         index: (r,) rows of the grid. block: (r,) their blocks.
         wanted, cause: (n, axes). beside: (n, axes) each, other regressors of the wanted series.
     """
-    steps = delay / GRID
+    steps = delay / CLOCKS.grid
     low = int(np.floor(steps))
     part = steps - low
     out = []
@@ -90,7 +85,7 @@ def peak(delays: NDArray, curve: NDArray) -> float:
         return float("nan")
     left, middle, right = curve[top - 1 : top + 2]
     bend = left - 2 * middle + right
-    return float(delays[top] + STEP * (0.5 * (left - right) / bend if bend < 0 else 0.0))
+    return float(delays[top] + CLOCKS.step * (0.5 * (left - right) / bend if bend < 0 else 0.0))
 
 
 def delay_of(delays: NDArray, sums: NDArray) -> tuple[float, float]:

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.flights.alignment import Alignment
 from crazyem.diagnosis.flights.inputs import inputs_of
+from crazyem.diagnosis.settings import RECORDINGS
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
 from crazyem.recordings.airborne import airtime
@@ -17,23 +18,6 @@ from crazyem.recordings.ordering import ordered
 from crazyem.recordings.recording import Recording, onboard_estimate
 from crazyem.vehicle import GRAVITY, Vehicle
 
-SAME_NODE = 1.5e-3  # s; measurements that are closer belong to one row (node)
-MAX_GAP = 0.1  # s, largest step between nodes or between inputs that is used
-# s, length of blocks; shorter in a short flight, so that there are `BLOCKS` blocks, twice the number of nuisances.
-# Scores are correlated for tenths of a second.
-BLOCK, SHORT, BLOCKS = 1.0, 0.5, 40
-# V, standard deviation of means over a second, below which the voltage is constant. It is 12 mV and more in 51 flights
-# of the simulated firmware, 32 mV and more in 19 of CrazyPAD and NanoBench. With a gain of 0.4/V, 5 mV are 0.2 % of
-# thrust.
-STEADY_VOLTAGE = 5e-3
-NEAR = 0.03  # s, largest distance to a sample of the accelerometer for an interpolated value
-SHORTEST = 4.0  # s, shortest flight for a diagnosis
-# s, typical interval of samples that are kept. Filters of gyros and of state estimates take 2 to 5 ms (a low pass of
-# 80 Hz: 2.8 ms, crazyflie-firmware sensors_bmi088_bmp3xx.c). Closer samples show the dynamics of the filter, which the
-# model does not have; in hover they look like a negative damping. The dynamics of interest need about ten samples in a
-# rise time (Ljung, System Identification, 1999, 13.7).
-SAMPLING = 0.01
-PIECE = 60.0  # s after which the filter starts again, so that long flights are filtered in pieces
 COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 COMMANDS = ("motor_command", "motor_request", "mixer_command")
 YAW = "stateEstimate.yaw"  # deg, right-handed
@@ -71,7 +55,7 @@ class Flight:
         time: (n,) s on the recording's clock, increasing.
         starts: (n,) bool, rows at which the filter starts again.
         gaps: (n,) bool, rows without a known path in the step before, over which nothing is integrated. Each is a
-            start. At the other starts, the path of the step is known (`PIECE`, `Data.leave_out_wild`).
+            start. At the other starts, the path of the step is known (`RECORDINGS.piece`, `Data.leave_out_wild`).
         y: (n, 13) position [m], velocity [m/s], attitude (x y z w), body rate [rad/s]; NaN where not measured.
         force: (n, 3) accelerometer [m/s^2, body]; NaN where not measured.
         voltage: (n,) V; NaN where unknown.
@@ -162,11 +146,7 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
     y = np.full((time.size, 13), np.nan)
     for name, (when, value) in measured.items():
         _place(y[:, COLUMNS[name]], time, when, value)
-    force = np.full((time.size, 3), np.nan)
-    if "specific_force" in recording.signals:
-        when, value = ordered(recording.signals["specific_force"])  # stamps of another log block
-        near = np.abs(when[np.clip(np.searchsorted(when, time), 0, when.size - 1)] - time) < NEAR
-        force[near] = np.stack([np.interp(time[near], when, column) for column in value.T], 1)
+    force = _force_at(recording, time)
     fresh = np.concatenate([[True], np.any((y[1:] != y[:-1]) & np.isfinite(y[1:]), axis=1)])  # no repeated rows
     time, y, force = time[fresh], y[fresh], force[fresh]
     y[:, 6:10] /= np.linalg.norm(y[:, 6:10], axis=1, keepdims=True)
@@ -185,10 +165,11 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
         fused=onboard_estimate(recording), grounded=bool(np.isfinite(air.ground)),
         levelled=found.level is not None, alignment=found.alignment, notices=found.notices,
     )  # fmt: skip
-    if flight.duration < SHORTEST:
+    if flight.duration < RECORDINGS.min_duration:
         raise DataError(
             f"{recording.path}: {flight.duration:.1f} of {air.seconds:.1f} s in the air have samples no more than "
-            f"{MAX_GAP:g} s apart, which is too short for a diagnosis (at least {SHORTEST:g} s)"
+            f"{RECORDINGS.max_gap:g} s apart, which is too short for a diagnosis "
+            f"(at least {RECORDINGS.min_duration:g} s)"
         )
     return flight
 
@@ -197,17 +178,28 @@ def _changes(time: NDArray, voltage: NDArray) -> bool:
     """Whether voltages (n,) V at (n,) s change in flight; a constant one does not show the effect of voltage."""
     second = ((time - time[0]) // 1.0).astype(int)
     means = np.bincount(second, voltage) / np.maximum(np.bincount(second), 1)
-    return bool(np.std(means[np.bincount(second) > 0]) > STEADY_VOLTAGE)
+    return bool(np.std(means[np.bincount(second) > 0]) > RECORDINGS.steady_voltage)
+
+
+def _force_at(recording: Recording, time: NDArray) -> NDArray:
+    """(n, 3) interpolated specific force [m/s^2]; NaN where no sample is near."""
+    force = np.full((time.size, 3), np.nan)
+    if "specific_force" in recording.signals:
+        when, value = ordered(recording.signals["specific_force"])  # stamps of another log block
+        distance = np.abs(when[np.clip(np.searchsorted(when, time), 0, when.size - 1)] - time)
+        near = distance < RECORDINGS.max_force_distance
+        force[near] = np.stack([np.interp(time[near], when, column) for column in value.T], 1)
+    return force
 
 
 def thinned(time: NDArray, value: NDArray) -> tuple[NDArray, NDArray]:
-    """The first sample of a stream (n,), (n, k) in each interval of about `SAMPLING`; all samples of a slower stream.
+    """The first sample of a stream (n,), (n, k) in each `RECORDINGS.sample_period`; all samples of a slower stream.
 
     Intervals are whole periods of the stream and begin halfway between samples, so that jitter of stamps moves no
     sample to another interval. If the first sample is lost, the next one is taken.
     """
-    period = float(np.median(np.diff(time))) if time.size > 1 else SAMPLING
-    every = math.floor(SAMPLING / period + 0.1) if period > 0.0 else 1
+    period = float(np.median(np.diff(time))) if time.size > 1 else RECORDINGS.sample_period
+    every = math.floor(RECORDINGS.sample_period / period + 0.1) if period > 0.0 else 1
     if every < 2:
         return time, value
     keep = np.diff(np.floor((time / period + 0.5) / every), prepend=-np.inf) > 0
@@ -273,23 +265,23 @@ def _nodes(times: Sequence[NDArray], airborne: Sequence[tuple[float, float]]) ->
         return time
     nodes = [time[0]]
     for t in time[1:]:
-        if t - nodes[-1] > SAME_NODE:
+        if t - nodes[-1] > RECORDINGS.same_time:
             nodes.append(t)
     return np.array(nodes)
 
 
 def _place(target: NDArray, nodes: NDArray, when: NDArray, value: NDArray) -> None:
     at = np.clip(np.searchsorted(nodes, when, "right") - 1, 0, nodes.size - 1)
-    near = (np.abs(nodes[at] - when) < SAME_NODE) & np.all(np.isfinite(value), axis=1)
+    near = (np.abs(nodes[at] - when) < RECORDINGS.same_time) & np.all(np.isfinite(value), axis=1)
     target[at[near]] = value[near]
 
 
 def _gaps(time: NDArray, commands: NDArray, airborne: Sequence[tuple[float, float]]) -> NDArray:
     """Rows at which a stretch of path begins: after gaps of measurements or inputs, and at take-off."""
-    gaps = np.concatenate([[True], np.diff(time) > MAX_GAP])
-    for g in np.flatnonzero(np.diff(commands) > MAX_GAP):  # any step that touches a gap of the inputs
-        gaps |= (time > commands[g]) & (time <= commands[g + 1] + MAX_GAP)
-    gaps |= (time <= commands[0]) | (time > commands[-1] + MAX_GAP)
+    gaps = np.concatenate([[True], np.diff(time) > RECORDINGS.max_gap])
+    for g in np.flatnonzero(np.diff(commands) > RECORDINGS.max_gap):  # any step that touches a gap of the inputs
+        gaps |= (time > commands[g]) & (time <= commands[g + 1] + RECORDINGS.max_gap)
+    gaps |= (time <= commands[0]) | (time > commands[-1] + RECORDINGS.max_gap)
     for begin, _ in airborne:
         at = int(np.searchsorted(time, begin))
         if at < time.size:
@@ -298,17 +290,19 @@ def _gaps(time: NDArray, commands: NDArray, airborne: Sequence[tuple[float, floa
 
 
 def _starts(time: NDArray, gaps: NDArray) -> NDArray:
-    """Rows at which the filter starts: at gaps and every `PIECE` seconds."""
+    """Rows at which the filter starts: at gaps and every `RECORDINGS.piece` seconds."""
     starts, began = gaps.copy(), time[0]
     for k in range(time.size):
         if starts[k]:
             began = time[k]
-        elif time[k] - began > PIECE:
+        elif time[k] - began > RECORDINGS.piece:
             starts[k], began = True, time[k]
     return starts
 
 
 def _blocks(time: NDArray) -> NDArray:
     since = time - time[0]
-    index = np.floor(since / min(BLOCK, max(SHORT, float(since[-1]) / BLOCKS))).astype(np.int64)
+    index = np.floor(
+        since / min(RECORDINGS.block, max(RECORDINGS.short_block, float(since[-1]) / RECORDINGS.blocks))
+    ).astype(np.int64)
     return np.unique(index, return_inverse=True)[1].astype(np.int64)

@@ -10,16 +10,14 @@ from dataclasses import replace
 import numpy as np
 
 from crazyem.diagnosis.flights.flight import Flight
-
-AGREE = 0.02  # m, largest range of the floors of others; largest height of a drone below the floor
-LEAST = 2  # least number of others that show the floor
+from crazyem.diagnosis.settings import LEVELLING
 
 
 def on_one_floor(flights: Sequence[Flight], kept_apart: Sequence[Flight]) -> tuple[list[Flight], list[Flight]]:
     """The flights; those without a floor get the floor of the others, if these agree and the flight is not below it."""
     everyone = [*flights, *kept_apart]
     shown = [f.ground for f in everyone if f.grounded]
-    if len(shown) < LEAST or len(shown) == len(everyone) or np.ptp(shown) > AGREE:
+    if len(shown) < LEVELLING.min_floors or len(shown) == len(everyone) or np.ptp(shown) > LEVELLING.floor_range:
         return list(flights), list(kept_apart)
     level = float(np.median(shown))
     return [_stood(f, level) for f in flights], [_stood(f, level) for f in kept_apart]
@@ -27,7 +25,7 @@ def on_one_floor(flights: Sequence[Flight], kept_apart: Sequence[Flight]) -> tup
 
 def _stood(flight: Flight, level: float) -> Flight:
     height = flight.y[:, 2]
-    if flight.grounded or not np.isfinite(height).any() or float(np.nanmin(height)) < level - AGREE:
+    if flight.grounded or not np.isfinite(height).any() or float(np.nanmin(height)) < level - LEVELLING.floor_range:
         return flight
     said = f"the drone is never seen at rest, so the floor is taken to be where the others have it, z = {level:.3f} m"
     return replace(flight, ground=level, notices=(*flight.notices, said))

@@ -19,12 +19,8 @@ from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.flights.flight import Flight, Frame
+from crazyem.diagnosis.settings import LEVELLING, RECORDINGS
 from crazyem.vehicle import GRAVITY
-
-STEP, WIDTH = 0.01, 21  # s, samples: polynomials (Savitzky and Golay) whose second derivative is the acceleration
-BLOCK, LEAST = 1.0, 8  # s, length of the blocks for standard deviations; least number of blocks
-SMALLEST = 1e-5  # rad, least standard deviation; a drone that stands on the floor has no scatter
-LIKELY = 1e-3  # p-value of equal frames, above which nothing is done
 
 
 def alike(flights: Sequence[Flight], kept_apart: Sequence[Flight]) -> tuple[list[Flight], list[Flight]]:
@@ -55,10 +51,10 @@ def tilt_of(flight: Flight) -> tuple[NDArray, NDArray] | None:
     rows = [r for r in rows if r.size]
     if not rows:
         return None
-    own = [np.floor(np.arange(len(r)) * STEP / BLOCK).astype(int) for r in rows]
+    own = [np.floor(np.arange(len(r)) * LEVELLING.step / RECORDINGS.block).astype(int) for r in rows]
     first = np.cumsum([0, *(b[-1] + 1 for b in own[:-1])])
     block = np.concatenate([b + f for b, f in zip(own, first, strict=True)])
-    if block.max() + 1 < LEAST:
+    if block.max() + 1 < LEVELLING.min_blocks:
         return None
     whole = np.concatenate(rows)
     lean, error = np.zeros(2), np.zeros(2)
@@ -72,21 +68,25 @@ def _stretches(flight: Flight) -> list[NDArray]:
     seen = np.isfinite(flight.y[:, [0, 6]]).all(1)
     piece = np.cumsum(flight.gaps)
     parts = [np.flatnonzero(seen & (piece == p)) for p in np.unique(piece)]
-    return [p for p in parts if p.size > 4 and flight.time[p[-1]] - flight.time[p[0]] > 2 * WIDTH * STEP]
+    return [
+        p for p in parts if p.size > 4 and flight.time[p[-1]] - flight.time[p[0]] > 2 * LEVELLING.width * LEVELLING.step
+    ]
 
 
 def _across(flight: Flight, part: NDArray) -> NDArray:
     """(k, 6): velocity [m/s], specific force along z, and along x and y [m/s^2], in the axes of the pose."""
     time = flight.time[part]
-    grid = np.arange(time[0], time[-1], STEP)
+    grid = np.arange(time[0], time[-1], LEVELLING.step)
     place = np.stack([np.interp(grid, time, c) for c in flight.y[part, :3].T], 1)
     attitude = flight.y[part, 6:10].copy()
     attitude[1:] *= np.cumprod(np.where(np.sum(attitude[1:] * attitude[:-1], axis=1) < 0, -1.0, 1.0))[:, None]
     back = Rotation.from_quat(np.stack([np.interp(grid, time, c) for c in attitude.T], 1)).inv()
-    velocity, acceleration = (savgol_filter(place, WIDTH, 3, deriv=d, delta=STEP, axis=0) for d in (1, 2))
+    velocity, acceleration = (
+        savgol_filter(place, LEVELLING.width, 3, deriv=d, delta=LEVELLING.step, axis=0) for d in (1, 2)
+    )
     force = back.apply(acceleration + np.array([0.0, 0.0, GRAVITY]))
     moved = back.apply(velocity)
-    return np.column_stack([moved, force[:, 2], force[:, :2]])[WIDTH // 2 : -(WIDTH // 2)]
+    return np.column_stack([moved, force[:, 2], force[:, :2]])[LEVELLING.width // 2 : -(LEVELLING.width // 2)]
 
 
 def _constant(explaining: NDArray, across: NDArray, block: NDArray) -> tuple[float, float]:
@@ -99,7 +99,7 @@ def _constant(explaining: NDArray, across: NDArray, block: NDArray) -> tuple[flo
     theta = inverse @ b.sum(0)
     rest = b - a @ theta
     covariance = inverse @ (rest.T @ rest) @ inverse * count / (count - 2)
-    return float(theta[1]), max(SMALLEST, float(np.sqrt(covariance[1, 1])))
+    return float(theta[1]), max(LEVELLING.min_angle_sd, float(np.sqrt(covariance[1, 1])))
 
 
 def _deviation(tilt: NDArray, sd: NDArray, fitted: int) -> NDArray:
@@ -107,7 +107,7 @@ def _deviation(tilt: NDArray, sd: NDArray, fitted: int) -> NDArray:
     weight = sd**-2.0
     mean = float(weight @ tilt / weight.sum())
     spread, freedom = float(weight @ (tilt - mean) ** 2), tilt.size - 1
-    if stats.chi2.sf(spread, freedom) > LIKELY:
+    if stats.chi2.sf(spread, freedom) > LEVELLING.equal_p:
         return np.zeros(tilt.size)
     between = max(0.0, (spread - freedom) / float(weight.sum() - (weight**2).sum() / weight.sum()))
     weight = 1.0 / (sd**2 + between)

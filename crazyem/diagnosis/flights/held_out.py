@@ -7,12 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights.flight import Flight
-
-# Horizontal speed [m/s] and body rate [rad/s] below which a flight hovers. Simulated hovers have 0.006 to 0.08 and 0.08
-# to 0.4 (in gusts), small shakes from 0.128 and 0.74 on. The velocity of a hover is mostly jitter of the onboard
-# estimate (see `sensing.jitter`), which does not determine a drag.
-STILL, STEADY = 0.1, 0.5
-LIVELIER = 3.0  # least ratio of the speeds: air in rooms moves, and flights of a kind differ by chance
+from crazyem.diagnosis.settings import RECORDINGS
 
 
 def swapped(fitted: Sequence[Flight], kept_apart: Sequence[Flight]) -> bool:
@@ -24,8 +19,10 @@ def swapped(fitted: Sequence[Flight], kept_apart: Sequence[Flight]) -> bool:
     if not kept_apart:
         return False
     here, there = np.array([_quick(f) for f in fitted]), np.array([_quick(f) for f in kept_apart])
-    hovers = bool(np.all(here[:, 0] < STILL) and np.all(here[:, 1] < STEADY))
-    return hovers and bool(np.any(there[:, 0] > max(STILL, LIVELIER * float(here[:, 0].max()))))
+    hovers = bool(np.all(here[:, 0] < RECORDINGS.hover_speed) and np.all(here[:, 1] < RECORDINGS.hover_rate))
+    return hovers and bool(
+        np.any(there[:, 0] > max(RECORDINGS.hover_speed, RECORDINGS.speed_ratio * float(here[:, 0].max())))
+    )
 
 
 def swap_sentence(fitted: Sequence[str], kept_apart: Sequence[str]) -> str:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights.alignment import Alignment, align
 from crazyem.diagnosis.flights.level import Level, level_of
+from crazyem.diagnosis.settings import RECORDINGS
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
 from crazyem.physics.rotors import thrust_from_command, thrust_from_speed, wrench
@@ -21,13 +22,8 @@ from crazyem.recordings.recording import Recording, onboard_estimate
 from crazyem.recordings.thrust import kind_objection, signal_for, too_slow
 from crazyem.vehicle import Vehicle
 
-NOMINAL_VOLTAGE = 3.85  # V under load, middle of 3.7 to 4.0 V, if no voltage is recorded
-# s. A command is held for 2 ms at 500 Hz; rates have a low pass of 80 Hz (2.8 ms). A recorded attitude is the
-# clock, and rates are behind it (physics/effects/onboard_filter.py).
-DELAY_OF_COMMANDS, BEHIND_ATTITUDE = 3.5e-3, 2.1e-3
 _SAMPLED = ("motor_command", "motor_request", "mixer_command")
 FULL = 65535.0  # counts of PWM
-STAND_IN = 0.01  # m, arm and torque per thrust of a vehicle without rotors; its value cancels
 
 _SANE = {**LARGEST_COMMAND, "wrench_command": 1e3, "mixer_command": 1e6}  # as `LARGEST_COMMAND`, SI and counts
 
@@ -100,12 +96,14 @@ def inputs_of(
     ground = flight.ground if flight is not None and np.isfinite(flight.ground) else 0.0
     level = None
     if found.sent is not None:
-        level = level_of(recording, vehicle, flight, found.time, found.sent, nominal=NOMINAL_VOLTAGE, until=until)
+        level = level_of(
+            recording, vehicle, flight, found.time, found.sent, nominal=RECORDINGS.nominal_voltage, until=until
+        )
         found = found if level is None else _sent(vehicle, found.time, found.sent, level)
     alignment = align(recording, found.time, found.thrust, flight) if name == "rotor_speed" else None
-    late = DELAY_OF_COMMANDS if name in _SAMPLED else alignment.delay if alignment is not None else 0.0
+    late = RECORDINGS.command_delay if name in _SAMPLED else alignment.delay if alignment is not None else 0.0
     if name in _SAMPLED and "attitude" in recording.signals:
-        late -= BEHIND_ATTITUDE
+        late -= RECORDINGS.rate_delay
     notices = found.notices if alignment is None else (*found.notices, alignment.said())
     rotor = RotorInput(
         found.time,
@@ -184,7 +182,7 @@ def _from_command_alone(recording: Recording, vehicle: Vehicle, time: _Array, va
 
 def _sent(vehicle: Vehicle, time: _Array, value: _Array, level: Level | None) -> _Found:
     """Thrust from sent commands with an assumed or estimated voltage."""
-    volts = NOMINAL_VOLTAGE if level is None else level.voltage
+    volts = RECORDINGS.nominal_voltage if level is None else level.voltage
     thrust = thrust_from_command(value, np.full(time.size, volts), thrust_curve=vehicle.thrust_curve)
     why = (
         f"{volts:g} V is assumed throughout, the middle of the 3.7 to 4.0 V of a loaded battery"
@@ -233,7 +231,9 @@ def _from_wrench(recording: Recording, vehicle: Vehicle, time: _Array, value: _A
     """Thrust from commanded thrust and torque, distributed to four rotors by the inverse of the mixing."""
     used = vehicle
     if min(*vehicle.arm, vehicle.torque_per_thrust) <= 0.0:
-        used = replace(vehicle, arm=(STAND_IN, STAND_IN), torque_per_thrust=STAND_IN)
+        used = replace(
+            vehicle, arm=(RECORDINGS.stand_in_arm, RECORDINGS.stand_in_arm), torque_per_thrust=RECORDINGS.stand_in_arm
+        )
     columns = wrench(np.eye(4), arm=used.arm, torque_per_thrust=used.torque_per_thrust)  # row: of one rotor
     thrust = np.linalg.solve(columns.T, value.T).T
     return _Found(time, thrust, _voltage(recording, time), vehicle=used)

@@ -13,19 +13,13 @@ from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 from scipy.optimize import brentq
 
+from crazyem.diagnosis.settings import LEVELLING
 from crazyem.physics.rotations import quaternion_from_euler
 from crazyem.physics.rotors import thrust_from_command
 from crazyem.recordings.airborne import Airtime
 from crazyem.recordings.ordering import ordered
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import GRAVITY, Vehicle
-
-CLEAR = 0.3  # m above the floor, from which there is no ground effect
-SOON = 5.0  # s after take-off, within which the drone must be that high; else the take-off itself counts
-LONG, SHORT = 3.0, 1.0  # s of flight that are used; least
-LOOKS = (0.2, 0.5, 1.0, 2.0)  # s after take-off at which a prediction already estimates the voltage
-SLOPE, FEWEST_HEIGHTS = 0.2, 4  # s, length of a linear fit of the height for a velocity; least number of heights
-ADMITTED = (0.4, 1.4)  # range of the voltage over the nominal one
 
 
 @dataclass(frozen=True)
@@ -56,7 +50,7 @@ def level_of(
     Args:
         time, command: (m,) s and (m, 4) sent duty, 0..1.
         nominal: V, centre of the search.
-        until: s, later samples are not used; if `until` is early, less than `SHORT` from take-off is enough.
+        until: s, later samples are not used; if `until` is early, less than `LEVELLING.min_use` is enough.
 
     Returns:
         None if the recording has neither velocity nor position, if the flight is too short, or if no admitted voltage
@@ -65,10 +59,10 @@ def level_of(
     moving = {"velocity", "position"} & set(recording.signals)
     if flight is None or not flight.flown or not moving or not vehicle.thrust_curve:
         return None
-    begin, short = _clear(recording, flight), SHORT
-    if begin + SHORT > until:
-        begin, short = flight.flown[0][0], 0.5 * LOOKS[0]
-    end = min(begin + LONG, max(e for b, e in flight.flown if b <= begin), until)
+    begin, short = _clear(recording, flight), LEVELLING.min_use
+    if begin + LEVELLING.min_use > until:
+        begin, short = flight.flown[0][0], 0.5 * LEVELLING.looks[0]
+    end = min(begin + LEVELLING.use, max(e for b, e in flight.flown if b <= begin), until)
     at, upwards = _climbing(recording, begin, end)
     if "velocity" not in recording.signals and at.size:
         begin, end = float(at[0]), float(at[-1])
@@ -86,7 +80,7 @@ def level_of(
         thrust = thrust_from_command(command[inside], volts, thrust_curve=vehicle.thrust_curve).sum(axis=1)
         return float(trapezoid(thrust * upright, grid) - wanted)
 
-    low, high = (share * nominal for share in ADMITTED)
+    low, high = (share * nominal for share in LEVELLING.voltage_range)
     if not lacking(low) < 0.0 < lacking(high):
         return None
     return Level(float(brentq(lacking, low, high, xtol=1e-4)), float(max(at[-1], grid[-1])))
@@ -101,20 +95,24 @@ def _climbing(recording: Recording, begin: float, end: float) -> tuple[NDArray, 
     at, upwards = when[seen], value[seen, 2]
     if shown == "velocity" or not at.size:
         return at, upwards
-    ends = np.array([at[0] + 0.5 * SLOPE, at[-1] - 0.5 * SLOPE])
-    near = [np.abs(at - e) <= 0.5 * SLOPE for e in ends]
-    if ends[0] >= ends[1] or min(n.sum() for n in near) < FEWEST_HEIGHTS:
+    ends = np.array([at[0] + 0.5 * LEVELLING.slope, at[-1] - 0.5 * LEVELLING.slope])
+    near = [np.abs(at - e) <= 0.5 * LEVELLING.slope for e in ends]
+    if ends[0] >= ends[1] or min(n.sum() for n in near) < LEVELLING.min_heights:
         return at[:0], upwards[:0]
     return ends, np.array([np.polyfit(at[n] - e, upwards[n], 1)[0] for n, e in zip(near, ends, strict=True)])
 
 
 def _clear(recording: Recording, flight: Airtime) -> float:
-    """Time at which the drone first is `CLEAR` above the floor [s]; else of take-off."""
+    """Time at which the drone first is `LEVELLING.clear_height` above the floor [s]; else of take-off."""
     took_off = flight.flown[0][0]
     if "position" not in recording.signals or not np.isfinite(flight.ground):
         return took_off
     when, place = ordered(recording.signals["position"])
-    high = when[(when >= took_off) & (when < took_off + SOON) & (place[:, 2] - flight.ground > CLEAR)]
+    high = when[
+        (when >= took_off)
+        & (when < took_off + LEVELLING.max_rise_time)
+        & (place[:, 2] - flight.ground > LEVELLING.clear_height)
+    ]
     return float(high[0]) if high.size else took_off
 
 

@@ -7,8 +7,7 @@ from typing import Any
 
 from crazyem.diagnosis.flights.alignment import Alignment
 from crazyem.diagnosis.flights.flight import Flight, Frame
-
-WORTH_TELLING = 0.005  # least relative difference of thrust that is told
+from crazyem.diagnosis.settings import RECORDINGS
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +73,6 @@ def _nuisances_of(flight: Flight, held_out: bool, strength: float | None) -> Rec
     notices = [*flight.notices]
     if flight.frame:
         notices.append(flight.frame.said())
-    if strength is not None and abs(strength - 1.0) > WORTH_TELLING:
+    if strength is not None and abs(strength - 1.0) > RECORDINGS.thrust_difference:
         notices.append(f"the thrust of this recording differs by {100.0 * (strength - 1.0):+.1f} % from the vehicle's")
     return RecordingNuisances(flight.name, held_out, flight.alignment, flight.frame, strength, tuple(notices))

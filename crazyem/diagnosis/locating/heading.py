@@ -14,20 +14,13 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.locating.locate import AXES, Finding
+from crazyem.diagnosis.settings import LOCATION
 from crazyem.physics.rotations import (
     quaternion_conjugate,
     quaternion_product,
     rotation_matrix,
     rotation_vector_from_quaternion,
 )
-
-WINDOW = 0.05  # s between the attitudes that are compared
-NATS, HELD = 15.0, 5.0  # nats; least gain on fitted and on held-out flights; healthy flights gain 5 at most
-SHARE = 0.1  # least expected gain on other flights, over the gain on the first, for which the other flights count
-SMALLEST = 5e-3  # rad, least standard deviation of the error along the flight
-FEWEST = 100  # least number of windows
-WAVES = (4.0, 2.0, 1.3, 1.0, 0.8)  # m, wavelengths; waves stay bounded where the other flight goes further
-DRAWN = 1e-2  # ridge, relative
 
 
 @dataclass(frozen=True)
@@ -69,15 +62,19 @@ def _finding(every: _Turns, other: _Turns | None, data: Data) -> Finding | None:
     gained = _nats(shapes, every, theta) - _used(_without(every.usual, shapes))
     asked = None if other is None else _shapes(other, middle)
     # a hover has its own biases, which may cost a tenth of the gain of a moving flight
-    if other is not None and asked is not None and _expected(asked, other, theta) > max(2 * HELD, SHARE * gained):
+    if (
+        other is not None
+        and asked is not None
+        and _expected(asked, other, theta) > max(2 * LOCATION.heading_held_out, LOCATION.heading_share * gained)
+    ):
         held = _nats(asked, other, theta)
     else:
-        second = (np.arange(len(shapes)) * WINDOW).astype(int) % 2 == 0
+        second = (np.arange(len(shapes)) * LOCATION.heading_window).astype(int) % 2 == 0
         one, two = (_Turns(*(getattr(every, n)[s] for n in _Turns.__annotations__)) for s in (second, ~second))
         held = _nats(shapes[~second], two, _ridge_fit(shapes[second], one))
     waves = _waves(every.place - middle)
     error = waves @ theta
-    if gained < NATS or held < HELD or error.std() < SMALLEST:
+    if gained < LOCATION.heading_gain or held < LOCATION.heading_held_out or error.std() < LOCATION.min_heading:
         return None
     axis = int(np.argmax([(waves[:, k::3] @ theta[k::3]).std() for k in range(3)]))
     time = data.flights[0].time[[0, -1]]
@@ -90,19 +87,19 @@ def _turns(flight: Flight) -> _Turns | None:
     """The windows of a flight; None if too few are without gaps."""
     known = np.isfinite(flight.y[:, [0, 6, 10]]).all(axis=1)
     rows = np.flatnonzero(known)
-    if rows.size < FEWEST:
+    if rows.size < LOCATION.min_windows:
         return None
     time, y = flight.time[rows], flight.y[rows]
     torn = np.cumsum(flight.gaps)[rows]
     rate = np.einsum("nij,nj->ni", rotation_matrix(y[:, 6:10]), y[:, 10:13])  # world
     angle = np.zeros_like(rate)
     angle[1:] = np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None], axis=0)
-    step = max(1, round(WINDOW / float(np.median(np.diff(time)))))
+    step = max(1, round(LOCATION.heading_window / float(np.median(np.diff(time)))))
     first = np.arange(0, time.size - step, step)
     last = first + step
-    whole = (torn[first] == torn[last]) & (time[last] - time[first] < 2 * WINDOW)
+    whole = (torn[first] == torn[last]) & (time[last] - time[first] < 2 * LOCATION.heading_window)
     first, last = first[whole], last[whole]
-    if first.size < FEWEST:
+    if first.size < LOCATION.min_windows:
         return None
     turned = quaternion_product(y[last, 6:10], quaternion_conjugate(y[first, 6:10]))  # about world axes
     turn = rotation_vector_from_quaternion(turned)
@@ -113,7 +110,7 @@ def _turns(flight: Flight) -> _Turns | None:
 
 def _waves(place: NDArray) -> NDArray:
     """(n, 30): sines and cosines of x, y, z, by waves."""
-    angle = [2 * np.pi / wave * place for wave in WAVES]
+    angle = [2 * np.pi / wave * place for wave in LOCATION.wavelengths]
     return np.hstack([f(x) for x in angle for f in (np.sin, np.cos)])
 
 
@@ -127,7 +124,8 @@ def _without(usual: NDArray, columns: NDArray) -> NDArray:
 
 
 def _ridge(x: NDArray) -> NDArray:
-    return x.T @ x + (DRAWN * np.trace(x.T @ x) / x.shape[1] + 1e-12) * np.eye(x.shape[1])  # regular without motion
+    size = x.shape[1]
+    return x.T @ x + (LOCATION.ridge * np.trace(x.T @ x) / size + 1e-12) * np.eye(size)  # regular without motion
 
 
 def _used(x: NDArray) -> float:

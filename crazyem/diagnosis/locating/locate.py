@@ -15,12 +15,11 @@ from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.gram import bounded
 from crazyem.diagnosis.fitting.model import Column, Model, Point, Swept
 from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.settings import LOCATION
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.rotations import rotation_matrix
 
 AXES = ("x", "y", "z")
-BINS = 4
-NOTABLE = 1e-4  # largest p-value of a finding that is listed
 
 
 @dataclass(frozen=True)
@@ -150,7 +149,7 @@ def locate(data: Data, point: Point) -> Located:
         disturbances.append(disturbance)
         for name, p in white.items():
             whiteness.setdefault(name, []).append(p)
-    kept = [f for f in findings if f.p_value < NOTABLE]
+    kept = [f for f in findings if f.p_value < LOCATION.finding_p]
     kept.sort(key=lambda f: -f.nats)
     return Located(
         tuple(kept), tuple(disturbances), {n: float(min(1.0, min(p) * len(p))) for n, p in whiteness.items()}
@@ -241,7 +240,7 @@ def _constant_and_change(
     found = []
     mean, sd = total_b / total_a, np.sqrt(dispersion / total_a)
     p = float(stats.t.sf(abs(mean / sd), max(len(b) - 1, 1)) * 2)
-    if p < NOTABLE:
+    if p < LOCATION.finding_p:
         found.append(Finding(signal, axis, "always", "", span, mean * unit, sd * unit, name,
                              0.5 * total_b * mean / dispersion - 1, p))  # fmt: skip
     # one change in flight: the split that gains most; the dispersion is about the means of both sides
@@ -258,7 +257,7 @@ def _constant_and_change(
         level = np.where(np.arange(len(b)) < k, before, after)
         scatter = max(1.0, float(((b - a * level) ** 2).sum() / total_a * len(b) / max(len(b) - 2, 1)))
         p = float(min(1.0, stats.f.sf(2 * gain / scatter, 1, max(len(b) - 2, 1)) * len(b)))
-        if p < NOTABLE:
+        if p < LOCATION.finding_p:
             error = np.sqrt(scatter * (1 / ca[k - 1] + 1 / (total_a - ca[k - 1])))
             when = float(0.5 * (times[k - 1] + times[k]))
             found.append(Finding(signal, axis, f"changes at {when:.1f} s", "time", (when, span[1]),
@@ -271,19 +270,19 @@ def _by_regime(
 ) -> list[Finding]:
     """Findings of disturbances that differ between the bins of a regime."""
     flight = model.flight
-    edges = np.quantile(values, np.linspace(0, 1, BINS + 1))
+    edges = np.quantile(values, np.linspace(0, 1, LOCATION.bins + 1))
     if not np.all(np.diff(edges) > 1e-9 * max(1.0, np.abs(edges).max())):
         return []
-    which = np.clip(np.searchsorted(edges, values, "right") - 1, 0, BINS - 1)
+    which = np.clip(np.searchsorted(edges, values, "right") - 1, 0, LOCATION.bins - 1)
     columns: list[Column] = []
-    for k in range(BINS):
+    for k in range(LOCATION.bins):
         w = (which == k).astype(float)
         columns += [*axis_columns(flight, w), *shown_columns(flight, w)[3:6]]
     per = 9
     swept = model.sweep(point, columns)
     found = []
     for i in range(per):
-        index = np.arange(BINS) * per + i
+        index = np.arange(LOCATION.bins) * per + i
         b = swept.score[:, index]
         a = swept.information[:, index][:, :, index]
         total_b, total_a = b.sum(0), a.sum(0)
@@ -293,10 +292,10 @@ def _by_regime(
         one = total_b.sum() / total_a.sum()
         gain = 0.5 * total_b @ theta - 0.5 * total_b.sum() * one
         residual = b - a @ theta
-        scatter = max(1.0, float(np.sum(residual**2) / np.trace(total_a) * len(b) / max(len(b) - BINS, 1)))
-        freedom = max(len(b) - BINS, 1)
-        p = float(stats.f.sf(2 * gain / scatter / (BINS - 1), BINS - 1, freedom))
-        if p >= NOTABLE:
+        scatter = max(1.0, float(np.sum(residual**2) / np.trace(total_a) * len(b) / max(len(b) - LOCATION.bins, 1)))
+        freedom = max(len(b) - LOCATION.bins, 1)
+        p = float(stats.f.sf(2 * gain / scatter / (LOCATION.bins - 1), LOCATION.bins - 1, freedom))
+        if p >= LOCATION.finding_p:
             continue
         signal, axis, label = _signal(i if i < 6 else i + 3)
         size = unit[i if i < 6 else 14]
@@ -307,7 +306,7 @@ def _by_regime(
         words = f"{name} {edges[k]:.3g} to {edges[k + 1]:.3g} {regime_unit}"
         found.append(Finding(signal, axis, words, name, (float(flight.time[rows[0]]), float(flight.time[rows[-1]])),
                              float(spread[k] * size), float(error * size), label,
-                             float(gain / scatter - (BINS - 1)), p))  # fmt: skip
+                             float(gain / scatter - (LOCATION.bins - 1)), p))  # fmt: skip
     return found
 
 

@@ -15,12 +15,9 @@ from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Column, Model, Point
 from crazyem.diagnosis.fitting.situation import initial_path
 from crazyem.diagnosis.locating.locate import AXES, Finding
+from crazyem.diagnosis.settings import LOCATION
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.vehicle import GRAVITY, Vehicle
-
-NATS = 25.0  # nats; least gain on fitted and on held-out flights
-SMALLEST = 0.01  # least standard deviation of the force along the flight, over the weight
-WEAK = 1e-4  # (m/s^2)^-2, precision of the prior
 
 
 @dataclass(frozen=True)
@@ -46,7 +43,7 @@ def depends_on_place(data: Data, apart: Data | None, point: Point) -> Place | No
         return None
     centre = np.median(np.concatenate([_path(m)[:, :3] for m in data.models]), axis=0)
     gram = _gram(data, point, centre)
-    prior = np.full(gram.size, WEAK)
+    prior = np.full(gram.size, LOCATION.prior_precision)
     solution = gram.solve(range(gram.size), precision=prior)
     dispersion = max(1.0, solution.dispersion)
     theta, held = solution.theta, solution.held_out
@@ -54,7 +51,7 @@ def depends_on_place(data: Data, apart: Data | None, point: Point) -> Place | No
         b, a = _gram(apart, point, centre).total(range(gram.size))
         held = float(b @ theta - 0.5 * theta @ a @ theta)
     gained = solution.gain / dispersion - gram.size
-    if min(gained, held / dispersion) < NATS:
+    if min(gained, held / dispersion) < LOCATION.min_structure:
         return None
     covariance = solution.covariance
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(3, 4)[:, 1:]
@@ -66,17 +63,17 @@ def depends_on_place(data: Data, apart: Data | None, point: Point) -> Place | No
 def left_by_place(data: Data, point: Point) -> float:
     """Gain of a force by place beside a model, less its number of parameters, in the linear approximation [nats]."""
     gram = _gram(data, point, np.median(np.concatenate([_path(m)[:, :3] for m in data.models]), axis=0))
-    solution = gram.solve(range(gram.size), precision=np.full(gram.size, WEAK))
+    solution = gram.solve(range(gram.size), precision=np.full(gram.size, LOCATION.prior_precision))
     return float(solution.gain / max(1.0, solution.dispersion) - gram.size)
 
 
 def slope_finding(data: Data, slopes: NDArray, errors: NDArray, nats: float, vehicle: Vehicle) -> Finding | None:
     """The strongest slope of a force by place, (3, 3) N/m with standard deviations, as a finding; None if the force
-    varies too little along these flights (`SMALLEST`)."""
+    varies too little along these flights (`LOCATION.force`)."""
     spread = np.concatenate([_path(m)[:, :3] for m in data.models]).std(axis=0)
     sizes = slopes * spread
     i, j = np.unravel_index(int(np.argmax(np.abs(sizes))), sizes.shape)
-    if abs(sizes[i, j]) < SMALLEST * vehicle.mass * GRAVITY:
+    if abs(sizes[i, j]) < LOCATION.force * vehicle.mass * GRAVITY:
         return None
     begin, end = (float(t) for t in data.flights[0].time[[0, -1]])
     size, sd, chance = float(sizes[i, j]), float(errors[i, j] * spread[j]), float(np.exp(-min(nats, 700.0)))

@@ -17,23 +17,12 @@ from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Column, Model, Point
 from crazyem.diagnosis.locating.locate import AXES, Finding, units_of
+from crazyem.diagnosis.settings import LOCATION, SPECTRUM
 from crazyem.physics.motion import body_of
 from crazyem.physics.rotors import wrench
 from crazyem.vehicle import GRAVITY
 
 AT_RANDOM = "at random"  # variable of such a finding; that of a finding by thrust is `rotor`
-CHANCE = 1e-5  # largest p-value that no rotor stands out, corrected for the number of rotors
-EACH = 2.33  # least t of roll with pitch, and of both with yaw; a product of inertia correlates two axes only
-LEAST = 0.03  # least correlation
-OUTLYING = 4.0  # standard deviations at which innovations are clipped
-SPAN = 5.0  # s of a piece for the spectrum; the speed of a rotor changes by less than a tenth in it
-FEWEST = 4  # least number of pieces
-SLOWEST, FASTEST = 1.5, 0.4  # Hz, onboard filters drift below; share of the sampling rate
-AROUND, APART = 4.0, 1.0  # Hz, half widths: of the surroundings of a hump, of the hump itself
-HUMP = 10.0  # least power over that of the surroundings; drones without a missing effect have up to 3.4
-FOOT, FARTHEST = 3.0, 2.0  # power over the surroundings at the end of a hump; Hz, longest reach of a hump
-SHAKEN = 0.15  # least torque over inertia, over the angular acceleration in the band; less may be an oscillating loop
-SMALLEST = 0.0004  # least torque over weight times arm
 PAIRS = ((0, 1), (0, 2), (1, 2))  # pairs of axes
 
 
@@ -49,7 +38,7 @@ def standardised(model: Model, point: Point, turned: NDArray | None = None) -> t
     if turned is not None:
         innovation, variance = innovation @ turned.T, variance @ np.square(turned).T
     z = np.divide(innovation, np.sqrt(variance), where=seen[:, None], out=np.zeros((seen.size, 3)))
-    return np.clip(z, -OUTLYING, OUTLYING), seen
+    return np.clip(z, -SPECTRUM.outlier, SPECTRUM.outlier), seen
 
 
 def memoryless(data: Data, point: Point) -> Point:
@@ -83,11 +72,11 @@ def erratic_rotor(models: Sequence[Model], point: Point) -> Finding | None:
         sign = np.array([np.sign(torque[rotor, i] * torque[rotor, j]) for i, j in PAIRS])
         turned = scores * sign
         tilt, yaw, all_three = (_t(s) for s in (turned[:, 0], turned[:, 1:].sum(1), turned.sum(1)))
-        if min(tilt, yaw) > EACH and all_three > best[0]:
+        if min(tilt, yaw) > SPECTRUM.min_t and all_three > best[0]:
             best = (all_three, rotor, float(turned.sum() / (3 * count)))
     t, rotor, correlation = best
     chance = min(1.0, 4.0 * float(stats.t.sf(t, len(scores) - 1)))
-    if chance > CHANCE or correlation < LEAST:
+    if chance > SPECTRUM.chance or correlation < SPECTRUM.min_correlation:
         return None
     noise = point.noise
     step = float(np.median(np.diff(models[0].flight.time)))
@@ -118,7 +107,7 @@ def _t(sums: NDArray) -> float:
 
 def spectrum(values: NDArray, period: float) -> tuple[NDArray, NDArray, int]:
     """Frequencies [Hz], mean power density [unit^2/Hz] of (n,) samples, and its number of pieces."""
-    size = round(SPAN / period)
+    size = round(SPECTRUM.piece / period)
     window = np.hanning(size)
     begins = range(0, values.size - size + 1, max(1, size // 2))
     powers = [np.abs(np.fft.rfft((p - p.mean()) * window)) ** 2 for b in begins for p in (values[b : b + size],)]
@@ -130,10 +119,10 @@ def spectrum(values: NDArray, period: float) -> tuple[NDArray, NDArray, int]:
 def hump(frequency: NDArray, power: NDArray) -> tuple[int, float]:
     """Index of the largest power over that of the surroundings, and this ratio."""
     best, where = 0.0, 0
-    inside = (frequency > SLOWEST) & (frequency < FASTEST * 2 * frequency[-1])
+    inside = (frequency > SPECTRUM.min_frequency) & (frequency < SPECTRUM.max_frequency * 2 * frequency[-1])
     for k in np.flatnonzero(inside):
         away = np.abs(frequency - frequency[k])
-        around = power[inside & (away > APART) & (away < AROUND)]
+        around = power[inside & (away > SPECTRUM.hump_width) & (away < SPECTRUM.surroundings)]
         if around.size >= 8 and power[k] > best * np.median(around):
             best, where = float(power[k] / np.median(around)), int(k)
     return where, best
@@ -160,23 +149,23 @@ def peaks(model: Model, point: Point) -> list[Peak]:
     found = []
     for i in range(3):
         frequency, power, pieces = spectrum(np.interp(grid, model.flight.time[seen], z[seen, i]), period)
-        if pieces >= FEWEST:
+        if pieces >= SPECTRUM.min_pieces:
             k, ratio = hump(frequency, power)
-            if ratio > HUMP:
+            if ratio > SPECTRUM.min_hump:
                 found.append(Peak(i, float(frequency[k]), ratio, pieces, reach_of(frequency, power, k, ratio)))
     return found
 
 
 def reach_of(frequency: NDArray, power: NDArray, k: int, ratio: float) -> float:
-    """Reach of a hump to either side [Hz], where its power falls to `FOOT` times that of the surroundings.
+    """Reach of a hump to either side [Hz], where its power falls to `SPECTRUM.hump_end` times that of the surroundings.
 
     The frequency of a vibration by a rotor varies with the speed of the rotor.
     """
-    low = power < FOOT / ratio * power[k]
+    low = power < SPECTRUM.hump_end / ratio * power[k]
     below, above = np.flatnonzero(low[:k]), np.flatnonzero(low[k:])
     left = frequency[k] - frequency[below[-1]] if below.size else 0.0
     right = frequency[k + above[0]] - frequency[k] if above.size else 0.0
-    return float(np.clip(max(left, right), 0.5, FARTHEST))
+    return float(np.clip(max(left, right), 0.5, SPECTRUM.max_hump_width))
 
 
 def off_peak_gram(data: Data, point: Point, columns: Sequence[Column], found: Sequence[Sequence[Peak]]) -> Gram:
@@ -220,17 +209,17 @@ def humps(model: Model, point: Point) -> list[Finding]:
     period = float(np.median(np.diff(flight.time)))
     grid = np.arange(flight.time[0], flight.time[-1], period)
     span = (float(flight.time[0]), float(flight.time[-1]))
-    least = SMALLEST * point.vehicle.mass * GRAVITY * max(*point.vehicle.arm, 0.01)
+    least = LOCATION.torque * point.vehicle.mass * GRAVITY * max(*point.vehicle.arm, 0.01)
     found = []
     for i, at, ratio, pieces, _ in peaks(model, point):
         amplitude, sd = amplitude_of(model, point, i, at)
         if model.shown is None:  # the model left the range of numbers
             continue
         frequency, rate, _ = spectrum(np.interp(grid, flight.time, model.shown[:, 10 + i]), period)
-        band = np.abs(frequency - at) <= APART
+        band = np.abs(frequency - at) <= SPECTRUM.hump_width
         swing = float(np.sqrt(2 * np.trapezoid((rate * (2 * np.pi * frequency) ** 2)[band], frequency[band])))
         torque = amplitude * float(units_of(point)[3 + i])
-        if amplitude < SHAKEN * swing or torque < least:
+        if amplitude < SPECTRUM.min_hump_torque * swing or torque < least:
             continue
         nats = pieces / 2 * (ratio - 1 - np.log(ratio))  # pieces overlap by half
         where, chance = f"frequency {at:.1f} Hz", float(np.exp(-min(nats, 700.0)))

@@ -14,18 +14,11 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.gram import Gram, Solution
 from crazyem.diagnosis.fitting.model import Model, Point
+from crazyem.diagnosis.settings import ACCELEROMETER
 from crazyem.physics.effects.sensing import ACCELEROMETER_MISALIGNMENT
 
 EFFECT = ACCELEROMETER_MISALIGNMENT.name
 ANGLES = ("roll", "pitch", "yaw")
-STEP = 1e-3  # rad
-BIAS_SD = 0.03  # m/s^2; the bias that remains after the firmware removes it at rest
-LAG_SD = 0.02  # s
-UNSEEN_SD = 0.1  # rad; prior of the yaw: thrust along body z does not determine it, and boards are glued within degrees
-LEAST = 3e-3  # rad; least roll or pitch of a finding
-# rad; error of roll and pitch beyond the scatter of blocks. In 42 simulated drones (seeds 2038 to 2041) the intervals
-# hold 80 of 84 angles with it, and 75 without it.
-BESIDE_SCATTER = 5e-4
 
 
 def tilt(data: Data, point: Point) -> tuple[Solution, Gram] | None:
@@ -37,9 +30,11 @@ def tilt(data: Data, point: Point) -> tuple[Solution, Gram] | None:
         return None
     gram = Gram(np.concatenate([g.score for g in grams]), np.concatenate([g.information for g in grams]),
                 np.concatenate([np.full(len(g.score), i) for i, g in enumerate(grams)]))  # fmt: skip
-    precision = np.array([0.0] * 2 + [UNSEEN_SD**-2] + [BIAS_SD**-2] * 3 + [LAG_SD**-2])
+    precision = np.array(
+        [0.0] * 2 + [ACCELEROMETER.yaw_sd**-2] + [ACCELEROMETER.bias_sd**-2] * 3 + [ACCELEROMETER.lag_sd**-2]
+    )
     solution = gram.solve(range(7), precision=precision, tested=range(2))
-    more = np.diag([BESIDE_SCATTER**2] * 2 + [0.0] * 5)
+    more = np.diag([ACCELEROMETER.angle_sd**2] * 2 + [0.0] * 5)
     return replace(solution, covariance=solution.covariance + more), gram
 
 
@@ -51,7 +46,7 @@ def held_out_gain(data: Data, point: Point, angles: NDArray, *, yaw_sd: float) -
     """
     total, dispersion = 0.0, gram_dispersion(data, point)
     bare = [3, 4, 5, 6]
-    known = {2: yaw_sd**-2, **dict.fromkeys((3, 4, 5), BIAS_SD**-2), 6: LAG_SD**-2}
+    known = {2: yaw_sd**-2, **dict.fromkeys((3, 4, 5), ACCELEROMETER.bias_sd**-2), 6: ACCELEROMETER.lag_sd**-2}
     for model in data.models:
         # the dispersion applies to the residuals, not to the priors
         b, a = (v / dispersion for v in _of(model, point).total(range(7)))
@@ -87,8 +82,8 @@ def _of(model: Model, point: Point) -> Gram:
     assert measured is not None
     there = replace(situation, specific_force=force)
     for i, angle in enumerate(ANGLES):
-        values = {**dict.fromkeys(ANGLES, 0.0), angle: STEP}
-        columns[i] = measured(there, **values).specific_force / STEP
+        values = {**dict.fromkeys(ANGLES, 0.0), angle: ACCELEROMETER.step}
+        columns[i] = measured(there, **values).specific_force / ACCELEROMETER.step
     for i in range(3):
         columns[3 + i, :, i] = 1.0
     columns[6] = -np.gradient(force, flight.time, axis=0)

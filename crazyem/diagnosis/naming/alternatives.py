@@ -15,9 +15,8 @@ from crazyem.diagnosis.fitting.fit import Data, DivergedError
 from crazyem.diagnosis.fitting.nuisances import refine_anew, refine_base, without
 from crazyem.diagnosis.naming.detection_limits import at_the_end, matters
 from crazyem.diagnosis.naming.load_or_rotors import refitted, tuned_of
-from crazyem.diagnosis.naming.trials import SURE, Selection, Step, Trial, distinguishable, margin, not_beaten
-
-NEAR = 100.0  # nats; a rival that was worse by less when it was tried is compared again
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, margin, not_beaten
+from crazyem.diagnosis.settings import SELECTION
 
 
 def named_again(
@@ -37,12 +36,18 @@ def named_again(
     return selection
 
 
-def close_alternatives(step: Step, accepted: Sequence[Candidate], *, near: float = NEAR) -> list[Trial]:
+def close_alternatives(
+    step: Step, accepted: Sequence[Candidate], *, near: float = SELECTION.rival_difference
+) -> list[Trial]:
     """Significant rivals within `near` nats of the effect when it was taken, which are not in the model now."""
     taken, names = step.taken, {c.effect for c in accepted}
     assert taken is not None
     tried = [t for t in step.trials if t.fitted is not None and t.blocks.size == taken.blocks.size]
-    return [t for t in tried if t.candidate.effect not in names and t.p_value < SURE and margin(taken, t)[0] < near]
+    return [
+        t
+        for t in tried
+        if t.candidate.effect not in names and t.p_value < SELECTION.p_value and margin(taken, t)[0] < near
+    ]
 
 
 def _reselected(
@@ -51,7 +56,7 @@ def _reselected(
     step = next(s for s in selection.steps if s.taken and s.taken.candidate.effect == name)
     mine = next(c for c in selection.accepted if c.effect == name)
     ended = at_the_end(selection.final, mine)  # then it stands for something else, whatever its evidence
-    others = close_alternatives(step, selection.accepted, near=np.inf if ended else NEAR)
+    others = close_alternatives(step, selection.accepted, near=np.inf if ended else SELECTION.rival_difference)
     if not others:
         return selection
     say(f"  asking again: {mine.label} or {', '.join(t.candidate.label for t in others)}")

@@ -15,17 +15,16 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import by_a_wrong_lag, solved, systematic_sd
 from crazyem.diagnosis.naming.balance import Balance, how_weak, prefers
 from crazyem.diagnosis.naming.balance import steady as steadily
-from crazyem.diagnosis.naming.corroboration import TELLING
 from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, instead_of_a_load
-from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, one_factor, trust
-from crazyem.diagnosis.naming.steady_odds import EDGE, decided_by_balance
+from crazyem.diagnosis.naming.named import Named, Value, one_factor, trust
+from crazyem.diagnosis.naming.steady_odds import decided_by_balance
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, preferred, wald
 from crazyem.diagnosis.naming.unexplained import Unexplained
+from crazyem.diagnosis.settings import CONFIDENCE, LOADS, SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.mass_properties import ON_BOARD
 from crazyem.physics.effects.rotors import ROTOR_FAULT
 
-WITHIN = 0.05  # p-value above which the size of an effect may be neutral: its confidence is at most `DOUBTFUL`
 SHAKES = "hold the drone with its rotors turning: what shakes then is not the loop that swings with a wrong model"
 # A thrust scale gives the same signals as two changes, mass and inertias by one factor, except for forces of the air.
 HEAVIER = "weigh the drone: with {:.3g} times its mass and its inertias it would fly the same"
@@ -87,8 +86,8 @@ def answer_of(
         doubted = candidate.effect in selection.doubted
         by_day = _by_the_day(candidate, point, balance)
         none_of_it = wald(away, covariance, gram, used) if by_day is None else by_day[1]
-        if doubted or none_of_it > WITHIN:
-            confidence = min(confidence, DOUBTFUL)
+        if doubted or none_of_it > CONFIDENCE.neutral_p:
+            confidence = min(confidence, CONFIDENCE.doubtful)
         p_value = min(1.0, step.taken.p_value * max(1, selection.tried))
         # late inputs and late measurements are one model: fitted as the former, named by corroboration
         effect = CATALOGUE[candidate.effect]
@@ -103,7 +102,7 @@ def answer_of(
             separate.append(SHAKES)
         equal = [
             *(t.candidate.effect for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}),
-            *(name for name, nats in steady.items() if nats < TELLING),
+            *(name for name, nats in steady.items() if nats < SELECTION.separating),
             *(() if candidate.effect in corroborated else effect.same_as),
             *_in_place(candidate, in_place, selection),
             *_as_a_factor(candidate, step, point, covariance),
@@ -220,7 +219,11 @@ def _load_by_the_day(candidate: Candidate, point: Point, balance: Balance) -> tu
     thrust, about_x, about_y = np.sqrt(np.diag(balance.covariance))[:3]
     known = thrust**-2.0
     for axis, torque in (("x", about_y), ("y", about_x)):  # at the edge, the torque determines the weight, too
-        known += (ON_BOARD / torque) ** 2.0 if math.isclose(abs(values[axis]), EDGE * ON_BOARD, rel_tol=1e-6) else 0.0
+        known += (
+            (ON_BOARD / torque) ** 2.0
+            if math.isclose(abs(values[axis]), LOADS.max_place * ON_BOARD, rel_tol=1e-6)
+            else 0.0
+        )
     far = max(share, 1e-9)
     sds = {"mass": known**-0.5 * whole / (1.0 - share), "x": about_y / far, "y": about_x / far}
     found = {}

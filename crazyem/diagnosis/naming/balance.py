@@ -22,14 +22,13 @@ from crazyem.diagnosis.fitting.fit import Data, DivergedError, refine
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import nuisances, solved, with_nuisances
 from crazyem.diagnosis.naming.alternatives import exchanged
-from crazyem.diagnosis.naming.corroboration import TELLING
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
+from crazyem.diagnosis.settings import LOADS, SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.mass_properties import ON_BOARD, PAYLOAD
 from crazyem.physics.effects.rotors import ROTOR_FAULT
 from crazyem.physics.rotors import wrench
 
-HEAVIEST = 1.0  # a load's weight over the drone's
 # `Effect.imbalance` -> number of parameters that count. A rotor moves all four numbers in one ratio; a load moves three
 # within the bounds of its place.
 FREE = {"rotor": 1, "thrust": 1, "mean thrust": 1, "air": 3, "load": 3}
@@ -113,7 +112,7 @@ def _loaded(root: NDArray, lack: NDArray) -> float:
             return float(rest @ rest)
         return 2.0 * float(lsq_linear(root[:, 1:3], rest, (-most, most)).cost)
 
-    return float(minimize_scalar(distance, bounds=(0.0, HEAVIEST / (1.0 + HEAVIEST)), method="bounded").fun)
+    return float(minimize_scalar(distance, bounds=(0.0, LOADS.max_load / (1.0 + LOADS.max_load)), method="bounded").fun)
 
 
 def prefers(balance: Balance, one: Candidate, other: Candidate) -> float | None:
@@ -204,8 +203,8 @@ def _named(data: Data, selection: Selection, mine: Candidate, balance: Balance) 
         nats = prefers(balance, mine, trial.candidate)
         if nats is not None and trial.fitted is not None:
             rivals.append((nats, trial))
-    beaten = [r for r in rivals if r[0] < -TELLING]
-    simpler = [r for r in rivals if r[0] < TELLING and _numbers(r[1].candidate) < _numbers(mine)]
+    beaten = [r for r in rivals if r[0] < -SELECTION.separating]
+    simpler = [r for r in rivals if r[0] < SELECTION.separating and _numbers(r[1].candidate) < _numbers(mine)]
     if not beaten and not simpler:
         return selection, mine
     best = min(beaten or simpler, key=lambda entry: entry[0])[1]

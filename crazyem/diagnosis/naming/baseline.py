@@ -7,20 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import THRUST, TRIM
-from crazyem.diagnosis.fitting.days import PRIOR_FLIGHTS, day_sd
-from crazyem.diagnosis.fitting.fit import REACH, Data
+from crazyem.diagnosis.fitting.days import day_sd
+from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.fit import nominal as nominal_of
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import nuisances, refine_base, with_trim_noise
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming.balance import balance_of
+from crazyem.diagnosis.settings import FITTING
 from crazyem.errors import UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Days, Vehicle
-
-INSIDE = 0.99  # share of a prior's reach; a number within it is determined
 
 
 def with_baseline(
@@ -62,7 +61,11 @@ def rotor_aerodynamics(data: Data, point: Point) -> dict[str, dict[str, float]]:
         if candidate.effect in CATALOGUE and CATALOGUE[candidate.effect].of_healthy_rotors:
             filed, here = candidate.neutral(point), candidate.values(point)
             found[candidate.effect] = {
-                name: float(here[name] if abs(here[name] - filed[name]) < INSIDE * REACH * w**-0.5 else filed[name])
+                name: float(
+                    here[name]
+                    if abs(here[name] - filed[name]) < FITTING.within_reach * FITTING.max_deviation * w**-0.5
+                    else filed[name]
+                )
                 for name, w in zip(candidate.free, precisions, strict=True)
             }
     return found
@@ -77,9 +80,9 @@ def _nominal(data: Data, vehicle: Vehicle) -> Point:
 def spread_of(found: NDArray, usual: NDArray) -> tuple[NDArray, NDArray]:
     """(k,) means of numbers of flights (n, k), and (k,) scales of the t distribution for the next flight.
 
-    usual: (k,) standard deviations for any drone, which count as `PRIOR_FLIGHTS` flights: the conjugate prior of a
-    variance (Gelman et al., Bayesian Data Analysis, 3.3). Degrees of freedom: `PRIOR_FLIGHTS` + n - 1.
+    usual: (k,) standard deviations for any drone, which count as p = `FITTING.prior_flights` flights: the conjugate
+    prior of a variance (Gelman et al., Bayesian Data Analysis, 3.3). Degrees of freedom: p + n - 1.
     """
     n, mean = len(found), found.mean(axis=0)
-    squares = PRIOR_FLIGHTS * np.square(usual) + np.square(found - mean).sum(axis=0)
-    return mean, np.sqrt(squares / (PRIOR_FLIGHTS + n - 1.0) * (1.0 + 1.0 / n))
+    squares = FITTING.prior_flights * np.square(usual) + np.square(found - mean).sum(axis=0)
+    return mean, np.sqrt(squares / (FITTING.prior_flights + n - 1.0) * (1.0 + 1.0 / n))

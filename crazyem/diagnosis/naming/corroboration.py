@@ -14,18 +14,10 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Model, Point
 from crazyem.diagnosis.flights import band_delay as band
+from crazyem.diagnosis.settings import CLOCKS, RECORDINGS
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.ordering import ordered
 from crazyem.recordings.recording import Recording
-
-TELLING = 3.0  # nats from which another signal separates two effects
-# s; lag of an accelerometer behind a force without delay. Its low pass of 30 Hz (second order; firmware of the
-# Crazyflie, default of PX4) takes 7.5 ms; 28 simulated flights without delay: median 7.4, 1.48 MAD 3.4 ms.
-PUNCTUAL, PUNCTUAL_SD = 7.5e-3, 3.4e-3
-REACH = 0.1  # s; largest delay that is tried, of either sign
-TWINS_SD = 0.01  # relative; difference of the speeds of two healthy rotors at one command
-SECOND = 100  # samples to a block
-FEWEST = 8  # least number of blocks
 
 
 def late_measurements(data: Data, nominal: Point, delay: float) -> float | None:
@@ -39,8 +31,11 @@ def late_measurements(data: Data, nominal: Point, delay: float) -> float | None:
     if not lags:
         return None
     weight = sum(variance**-1 for _, variance in lags)
-    lag, variance = sum(lag / variance for lag, variance in lags) / weight, 1.0 / weight + PUNCTUAL_SD**2
-    return ((lag - PUNCTUAL - delay) ** 2 - (lag - PUNCTUAL) ** 2) / (2.0 * variance)
+    lag, variance = (
+        sum(lag / variance for lag, variance in lags) / weight,
+        1.0 / weight + CLOCKS.accelerometer_lag_sd**2,
+    )
+    return ((lag - CLOCKS.accelerometer_lag - delay) ** 2 - (lag - CLOCKS.accelerometer_lag) ** 2) / (2.0 * variance)
 
 
 def _lag_of(model: Model, point: Point) -> tuple[float, float] | None:
@@ -48,16 +43,16 @@ def _lag_of(model: Model, point: Point) -> tuple[float, float] | None:
     flight = model.flight
     thrust = model.accelerations(point)[0][:, 2]
     known, shown = np.isfinite(thrust) & ~flight.starts, np.isfinite(flight.force[:, 2])
-    grid = np.arange(flight.time[0], flight.time[-1], band.GRID)
-    margin = round((REACH + band.SUPPORT) / band.GRID)
-    if min(known.sum(), shown.sum()) < 2 or grid.size < 2 * margin + band.FEWEST_BLOCKS * band.BLOCK / band.GRID:
+    grid = np.arange(flight.time[0], flight.time[-1], CLOCKS.grid)
+    margin = round((CLOCKS.max_sensor_delay + CLOCKS.filter_half) / CLOCKS.grid)
+    if min(known.sum(), shown.sum()) < 2 or grid.size < 2 * margin + CLOCKS.min_blocks * RECORDINGS.block / CLOCKS.grid:
         return None
     middle = flight.time - 0.5 * np.diff(flight.time, prepend=flight.time[0])  # thrust is the mean of the step before
     cause = band.band_passed(np.interp(grid, middle[known], thrust[known])[:, None])
     wanted = band.band_passed(np.interp(grid, flight.time[shown], flight.force[shown, 2])[:, None])
     index = np.arange(margin, grid.size - margin)
-    block = ((grid[index] - grid[margin]) / band.BLOCK).astype(int)
-    delays = band.delays_within(REACH)
+    block = ((grid[index] - grid[margin]) / RECORDINGS.block).astype(int)
+    delays = band.delays_within(CLOCKS.max_sensor_delay)
     sums = np.stack([band.products(index, block, wanted, cause, [], d) for d in delays], 2)
     total = sums.sum(1)
     lag, variance = band.delay_of(delays, total)[0], band.standard_error(delays, sums, total) ** 2
@@ -73,9 +68,9 @@ def false_speed(recordings: Sequence[Recording], rotor: int, scale: float, lag: 
     if not blocks:
         return None
     beyond = np.concatenate(blocks)
-    if beyond.size < FEWEST:
+    if beyond.size < CLOCKS.min_speed_blocks:
         return None
-    mean, variance = float(beyond.mean()), float(beyond.var(ddof=1)) / beyond.size + TWINS_SD**2
+    mean, variance = float(beyond.mean()), float(beyond.var(ddof=1)) / beyond.size + CLOCKS.twin_speed_sd**2
     return (mean**2 - (mean - float(np.log(scale))) ** 2) / (2.0 * variance)
 
 
@@ -97,7 +92,7 @@ def _beyond(recording: Recording, rotor: int, lag: float) -> NDArray | None:
         expected[k] = command[k - 1] + (expected[k - 1] - command[k - 1]) * decay
     seen = np.stack([np.interp(time, when, speed[:, i]) for i in range(4)], 1)
     flying &= np.all((expected > 0.01) & (seen > 1.0), axis=1)
-    if flying.sum() < FEWEST * SECOND:
+    if flying.sum() < CLOCKS.min_speed_blocks * CLOCKS.samples_of_block:
         return None
     x, y = np.log(expected[flying]), np.log(seen[flying])
     others = [i for i in range(4) if i != rotor]
@@ -105,5 +100,5 @@ def _beyond(recording: Recording, rotor: int, lag: float) -> NDArray | None:
     slope = np.polynomial.Polynomial.fit(x[:, others].ravel() - centre, y[:, others].ravel(), 2)
     away = y - slope(x - centre)
     difference = away[:, rotor] - away[:, others].mean(1)  # cancels the battery's state, which all rotors share
-    count = difference.size // SECOND
-    return difference[: count * SECOND].reshape(count, SECOND).mean(1)
+    count = difference.size // CLOCKS.samples_of_block
+    return difference[: count * CLOCKS.samples_of_block].reshape(count, CLOCKS.samples_of_block).mean(1)

@@ -9,16 +9,10 @@ from crazyem.diagnosis.fitting.conditions import conditions_of
 from crazyem.diagnosis.fitting.days import day_sd
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.settings import LOADS
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.external_force import GUSTS
 from crazyem.physics.effects.prior import Conditions
-
-LEAST_LOAD = 0.005  # share of the drone's mass; filters and sampling look like smaller loads
-LEAST_SHIFT = 1e-4  # m; least shift of the centre of mass
-GUSTIER = 2.0  # least gusts, as a multiple of those of the file
-DRAWN = 2.0  # standard deviations of the day's trim; least shift of the centre of mass
-# Standard deviations of the weight by a swing: least weight of such a load, and least thrust of an effect beside it.
-WEIGHED = 3.0
 
 
 def at_the_end(point: Point, candidate: Candidate) -> bool:
@@ -46,14 +40,14 @@ def _other_load(point: Point, candidate: Candidate, here: Mapping[str, float], f
     """
     daily = TRIM in point.vehicle.effects
     heavier = abs(here["mass"] - filed["mass"])
-    least = WEIGHED * _weight_error(candidate.effect) or LEAST_LOAD
+    least = LOADS.min_weight_sd * _weight_error(candidate.effect) or LOADS.min_load
     if heavier > (day_sd(point.vehicle)[0] if daily else least) * point.vehicle.mass:
         return True
     if "x" not in here or not (daily or filed["mass"] > 0.0):
         return False
     along_x, along_y = (here["mass"] * here[n] - filed["mass"] * filed[n] for n in "xy")
     drawn = float(np.hypot(along_x, along_y)) / point.vehicle.mass
-    return drawn > (DRAWN * day_sd(point.vehicle)[1] if daily else LEAST_SHIFT)
+    return drawn > (LOADS.min_trim_sd * day_sd(point.vehicle)[1] if daily else LOADS.min_shift)
 
 
 def _outweighs(point: Point, candidate: Candidate, data: Data) -> bool:
@@ -68,7 +62,7 @@ def _outweighs(point: Point, candidate: Candidate, data: Data) -> bool:
     without = point.with_effects({candidate.effect: candidate.neutral(point)})
     up, before = (np.concatenate([model.accelerations(p)[0][:, 2] for model in data.models]) for p in (point, without))
     lifted = float(np.sqrt(np.mean((up - before) ** 2) / np.mean(before**2)))
-    return lifted > WEIGHED * open_weight
+    return lifted > LOADS.min_weight_sd * open_weight
 
 
 def _conditions(point: Point, data: Data | None) -> Conditions:
@@ -82,7 +76,7 @@ def usual_gusts(point: Point, data: Data | None = None) -> float:
     """Standard deviation of the air's speed [m/s] below which gusts are usual and no finding."""
     filed = float(point.vehicle.effects.get(GUSTS.name, {}).get("standard_deviation", 0.0))
     limit = GUSTS.prior.detection_limit_in({}, _conditions(point, data))["standard_deviation"][0]
-    return max(GUSTIER * filed, limit)
+    return max(LOADS.min_gust_ratio * filed, limit)
 
 
 def matters(point: Point, candidate: Candidate, data: Data | None = None) -> bool:

@@ -18,13 +18,11 @@ from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.naming.answer import numbers_of
 from crazyem.diagnosis.naming.balance import Balance, by_balance
 from crazyem.diagnosis.naming.named import Named, Value
-from crazyem.diagnosis.naming.presence import LEAST_PROBABILITY
 from crazyem.diagnosis.naming.prune import left_out
 from crazyem.diagnosis.naming.steady import with_exact_torques
 from crazyem.diagnosis.naming.trials import Selection
+from crazyem.diagnosis.settings import CONFIDENCE
 from crazyem.physics.effects.catalogue import CATALOGUE
-
-NEAR = 1e-9  # of the larger end of a range; a number this close to an end is at the end
 
 
 def determined(effects: Sequence[Named], point: Point) -> tuple[tuple[Named, ...], dict[str, str]]:
@@ -73,14 +71,14 @@ def not_determined(candidate: Candidate, parameters: Mapping[str, Value], point:
 
 def improbable(chance: float) -> str:
     """Reason why an effect of this probability is no finding; "" if it is one."""
-    if chance >= LEAST_PROBABILITY:
+    if chance >= CONFIDENCE.min_probability:
         return ""
     return f"not determined: the flights make it probable with {chance:.2g} only"
 
 
 def at_an_end(value: float, ends: tuple[float, float], neutral: float) -> bool:
     """Whether a number is at an end of its range; neutral is no end."""
-    near = NEAR * max(abs(e) for e in ends)
+    near = CONFIDENCE.at_bound * max(abs(e) for e in ends)
     return min(abs(value - e) for e in ends) <= near and abs(value - neutral) > near
 
 

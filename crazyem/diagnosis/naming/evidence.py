@@ -19,9 +19,8 @@ from crazyem.diagnosis.fitting.fit import (
 from crazyem.diagnosis.fitting.gram import bounded
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import nuisances
+from crazyem.diagnosis.settings import SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
-
-FAR = 20.0  # nats; a larger gain of one linear step is checked by the likelihood
 
 
 def tuning(candidates: Sequence[Candidate], covariance: NDArray) -> float:
@@ -94,7 +93,7 @@ def gain_of_both(
     step = bounded(information + known, rest, low, high)
     gain = float(rest @ step - 0.5 * step @ (information + known) @ step)
     blocks, covariance = held_out.block_loglik(there.point), known_of(accepted, information + known)
-    if gain < FAR:
+    if gain < SELECTION.linear_gain:
         return back + gain, blocks, covariance
     # a linear gain this large is unreliable: the likelihood after the step decides
     looked = held_out.twin()

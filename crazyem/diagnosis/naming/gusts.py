@@ -12,18 +12,8 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Noise, Point
+from crazyem.diagnosis.settings import WIND
 from crazyem.physics.effects.drag import LINEAR_DRAG
-
-MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)  # s; correlation times that are tried
-GAINED = 40.0  # nats; least gain of gusts
-SHARE_SD = 0.2  # relative error of the spread: it depends on the memory, and forces have other errors
-# Error of the memory's logarithm beyond scatter: a flight has some ten memories, and a loop that leans into the wind
-# shortens them. In 21 simulated drones with gusts of 0.5 to 2 s (seeds 2038 and 2039) the rms error is 0.55.
-MEMORY_SD = 0.5
-SMALLEST = 0.08  # m/s^2; least spread: onboard filters leave less
-ALIKE = 3.0  # largest ratio between the axes' spreads for moving air, which acts on all axes
-KNOWN = 1e-3  # N s/m; a smaller drag is a nuisance near 0, not a found effect
-PUSH = 0.007  # N s/m; force by air speed on a drone of unknown drag (docs/reference/effects.md)
 
 
 @dataclass(frozen=True)
@@ -59,18 +49,18 @@ def find_gusts(data: Data, point: Point) -> Gusts | None:
         return data.loglik(found, passes=2), found
 
     first = fitted(1.0, point.noise, np.full(3, 0.1))
-    if first[0] - white < 0.5 * GAINED or first[1].noise.disturbance[:3].max() < 0.7 * SMALLEST:
+    if first[0] - white < 0.5 * WIND.min_gain or first[1].noise.disturbance[:3].max() < 0.7 * WIND.min_spread:
         return None
     reached = first[1].noise
     tried = {1.0: first}
-    for m in MEMORIES:
+    for m in WIND.memories:
         if m != 1.0:
             tried[m] = fitted(m, reached, np.sqrt(m) * reached.disturbance[:3])
     best = max(tried, key=lambda m: tried[m][0])
     gain = tried[best][0] - white
     spread = tried[best][1].noise.disturbance[:3]
     # a likelihood that still rises at the shortest memory is that of a force without one: errors of an onboard filter
-    if gain < GAINED or spread.max() < SMALLEST or best == MEMORIES[0]:
+    if gain < WIND.min_gain or spread.max() < WIND.min_spread or best == WIND.memories[0]:
         return None
     logs = np.log(np.array(sorted(tried)))
     heights = np.array([tried[m][0] for m in sorted(tried)])
@@ -80,16 +70,16 @@ def find_gusts(data: Data, point: Point) -> Gusts | None:
     seconds = sum(f.duration for f in data.flights)
     independent = max(3.0 * seconds / (2.0 * memory), 2.0)
     scatter = max(1.0 / np.sqrt(max(-2 * curve[0], 1e-9)), np.sqrt(2.0 / independent))
-    memory_sd = np.hypot(scatter, MEMORY_SD)
+    memory_sd = np.hypot(scatter, WIND.log_memory_sd)
     size = float(np.median(spread))  # the median: errors of thrust add to the force along z
     speed = size * point.vehicle.mass / push_of(point)
-    alike = bool(spread.max() < ALIKE * spread.min())
-    speed_sd = speed * float(np.hypot(1.0 / np.sqrt(2 * independent), SHARE_SD))
+    alike = bool(spread.max() < WIND.max_axis_ratio * spread.min())
+    speed_sd = speed * float(np.hypot(1.0 / np.sqrt(2 * independent), WIND.spread_sd))
     return Gusts(gain, spread, memory, float(memory_sd), alike, speed, speed_sd)
 
 
 def push_of(point: Point) -> float:
-    """Force by air speed [N s/m]: the mean linear drag if one was found, else `PUSH`."""
+    """Force by air speed [N s/m]: the mean linear drag if one was found, else `WIND.drag`."""
     drag = point.effects.get(LINEAR_DRAG.name)
     mean = float(np.mean([drag[a] for a in "xyz"])) if drag else 0.0
-    return mean if mean > KNOWN else PUSH
+    return mean if mean > WIND.known_drag else WIND.drag

@@ -7,14 +7,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from crazyem.diagnosis.naming.unexplained import Unexplained
+from crazyem.diagnosis.settings import CONFIDENCE
 from crazyem.physics.effects.catalogue import CATALOGUE
-
-# Largest confidence beside unexplained structure that an effect does not outweigh, or if a vibration explains as much.
-DOUBTFUL = 0.45
-# Held-out gain of an effect over the nats of the unexplained structure, at which the effect is right with a probability
-# of one half. Of 88 effects beside structure in 1268 simulated drones (seeds 2045 to 2048), 18 of 18 are right at a
-# ratio of 4 or more, 2 of 8 at 1 to 4, and 6 of 62 at less.
-OUTWEIGHS = 3.0
 
 
 @dataclass(frozen=True)
@@ -78,7 +72,7 @@ def trust(remains: Unexplained, held_out_nats: float = 0.0) -> float:
     if not remains.found:
         return explained
     times = max(held_out_nats, 0.0) / max(remains.nats, 1e-9)
-    return min(explained, max(DOUBTFUL, times**2 / (times**2 + OUTWEIGHS**2)))
+    return min(explained, max(CONFIDENCE.doubtful, times**2 / (times**2 + CONFIDENCE.outweighs**2)))
 
 
 def one_factor(values: NDArray, neutral: NDArray, covariance: NDArray) -> bool:

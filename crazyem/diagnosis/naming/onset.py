@@ -11,11 +11,10 @@ from crazyem.diagnosis.fitting.fit import Data, Fitted
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import refine_base
+from crazyem.diagnosis.settings import SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 ONSET = "onset_time"  # of effects that may begin in mid-flight
-DATED = 6.0  # nats; least gain of an onset
-SCANS = ((1.5, 0.1), (0.5, 0.1), (0.1, 0.02))  # s; reach to either side, and step between the onsets that are tried
 
 
 def onset_of(data: Data, point: Point, candidate: Candidate, gram: Gram, index: list[int]) -> Candidate | None:
@@ -36,12 +35,12 @@ def onset_of(data: Data, point: Point, candidate: Candidate, gram: Gram, index: 
     theta = after_b[k] / after_a[k] if after_a[k] > 0 else 0.0
     residual = b - a * theta * (np.arange(len(b)) >= k)
     scatter = max(1.0, float(residual @ residual / max(a.sum(), 1e-300) * len(b) / max(len(b) - 2, 1)))
-    if k < 2 or gains[k] - gains[0] < DATED * scatter:
+    if k < 2 or gains[k] - gains[0] < SELECTION.onset_gain * scatter:
         return None
     begins = float(flight.time[np.flatnonzero(flight.block == k)[0]])
     name, values = candidate.free[0], candidate.values(point)
     size = float(np.clip(values[name] + theta, *candidate.range_of(name)))
-    begins = likeliest(data, point, candidate, {**values, name: size}, begins, *SCANS[0])
+    begins = likeliest(data, point, candidate, {**values, name: size}, begins, *SELECTION.onset_scans[0])
     return replace(candidate, fixed=(*candidate.fixed, (ONSET, begins)))
 
 
@@ -64,7 +63,7 @@ def date(data: Data, fitted: Fitted, candidate: Candidate) -> tuple[Fitted, Cand
     begins = dict(candidate.fixed).get(ONSET)
     if begins is None:
         return fitted, candidate
-    for reach, step in SCANS:
+    for reach, step in SELECTION.onset_scans:
         begins = likeliest(data, fitted.point, candidate, candidate.values(fitted.point), begins, reach, step)
         moved = replace(candidate, fixed=tuple((n, begins if n == ONSET else v) for n, v in candidate.fixed))
         others = tuple(moved if c is candidate else c for c in fitted.candidates)

@@ -12,17 +12,14 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.naming import accelerometer, rotor_response
 from crazyem.diagnosis.naming.detection_limits import usual_gusts
 from crazyem.diagnosis.naming.gusts import find_gusts
-from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, around, trust
+from crazyem.diagnosis.naming.named import Named, Value, around, trust
 from crazyem.diagnosis.naming.presence import presence, presence_by_odds
-from crazyem.diagnosis.naming.prune import ADMITTED
-from crazyem.diagnosis.naming.trials import SURE
 from crazyem.diagnosis.naming.unexplained import Unexplained
+from crazyem.diagnosis.settings import ACCELEROMETER, CONFIDENCE, SELECTION, WIND
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.external_force import GUSTS
 from crazyem.physics.effects.timing import INPUT_DELAY, MOTOR_LAG
 from crazyem.vehicle import Vehicle
-
-FIXED = 0.3  # largest force that depends on place or motion beside gusts, as a share of their gain
 
 
 def other_likelihoods(
@@ -41,7 +38,7 @@ def other_likelihoods(
         say(GUSTS.name)
         gusts = find_gusts(data, point)
         known = gusts is not None and gusts.speed < usual_gusts(point, data)
-        if gusts is not None and not known and gusts.moving_air and remains.force_nats < FIXED * gusts.gain:
+        if gusts is not None and not known and gusts.moving_air and remains.force_nats < WIND.fixed_share * gusts.gain:
             memory_sd = gusts.memory * gusts.memory_sd
             # the interval of a memory that the flight does not determine is infinite
             p = next(p for p in GUSTS.parameters if p.name == "correlation_time")
@@ -70,8 +67,8 @@ def other_likelihoods(
             angles = solution.theta[:3]
             wald = float(stats.f.sf(np.sum((angles / sd)[:2] ** 2) / 2, 2, max(len(gram.score) - 7, 3)))
             held = accelerometer.held_out_gain(apart or data, point, angles, yaw_sd=float(sd[2]))
-            enough = max(solution.p_value, wald) < SURE and held > ADMITTED
-            if enough and np.abs(angles[:2]).max() > accelerometer.LEAST:
+            enough = max(solution.p_value, wald) < SELECTION.p_value and held > SELECTION.min_evidence
+            if enough and np.abs(angles[:2]).max() > ACCELEROMETER.min_angle:
                 values = {n: Value(float(a), "rad", float(e), around(float(a), float(e)))
                           for n, a, e in zip(accelerometer.ANGLES, angles, sd, strict=True)}  # fmt: skip
                 dispersion = max(1.0, solution.dispersion)
@@ -108,6 +105,6 @@ def late_rotors(
         p_value = float(np.exp(-min(late.nats, 700.0)))
         there = presence_by_odds(min(late.held_out, late.nats))
         sure = there * (0.5 if late.alike else 1.0)
-        sure = min(sure, DOUBTFUL) if deaf else sure
+        sure = min(sure, CONFIDENCE.doubtful) if deaf else sure
         named.append(Named(name, name, values, {}, late.held_out, p_value, sure, log_odds=float(logit(there))))
     return named, ((MOTOR_LAG.name, INPUT_DELAY.name),) if late.alike else ()

@@ -15,8 +15,9 @@ from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, rememberi
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import refine_base, solved, without
 from crazyem.diagnosis.locating.locate import AXES, Finding
-from crazyem.diagnosis.locating.place import NATS, left_by_place, slope_finding
-from crazyem.diagnosis.naming.trials import SEPARATION, Selection, scatter
+from crazyem.diagnosis.locating.place import left_by_place, slope_finding
+from crazyem.diagnosis.naming.trials import Selection, scatter
+from crazyem.diagnosis.settings import LOCATION, SELECTION
 from crazyem.physics.effects.external_force import FORCE_BY_PLACE
 
 FORCE = Candidate(FORCE_BY_PLACE.name, (), tuple(p.name for p in FORCE_BY_PLACE.parameters))
@@ -34,7 +35,10 @@ def by_place(
     if not names or "position" not in data.signals or TRIM in selection.final.vehicle.effects:
         return selection, None
     # an imitating effect has another shape: it leaves a force by place on the fitted or the held-out flights
-    if max(left_by_place(d.twin(), selection.final) for d in (data, held_out) if d is not None) < NATS:
+    if (
+        max(left_by_place(d.twin(), selection.final) for d in (data, held_out) if d is not None)
+        < LOCATION.min_structure
+    ):
         return selection, None
     rest = [c for c in selection.accepted if c not in names]
     bare = selection.final
@@ -55,7 +59,7 @@ def by_place(
         (named, flights), (instead, again) = data.workers.map(lambda run: both(*run), runs)
         theirs, ours = flights.block_loglik(named.point), again.block_loglik(instead.point)
         better = instead.loglik - named.loglik - len(FORCE.free) + sum(len(c.free) for c in names)
-        if better < NATS or better < SEPARATION * scatter(ours - theirs):
+        if better < LOCATION.min_structure or better < SELECTION.separation * scatter(ours - theirs):
             return selection, None
         finding = _finding(again, instead, better)
         if finding is None:

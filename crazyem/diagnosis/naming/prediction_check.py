@@ -17,13 +17,10 @@ from crazyem.diagnosis.naming.prune import left_out
 from crazyem.diagnosis.naming.trials import Selection
 from crazyem.diagnosis.prediction.horizon import UNITS, HorizonErrors, errors, open_loop, windows
 from crazyem.diagnosis.prediction.predict import recorded
+from crazyem.diagnosis.settings import SELECTION
 from crazyem.errors import DataError
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
-
-# Largest ratio of errors at 100 and 500 ms, geometric mean over position, velocity, attitude and rate. True effects
-# that were found in 210 simulated drones have at most 1.10 (late inputs, torque scales).
-WORSE = 1.2
 
 
 def without_what_misleads(
@@ -49,7 +46,7 @@ def without_what_misleads(
         fitted = with_found(vehicle, selection, accepted)
         return ratio(nominal, [_errors_of(r, fitted) for r in shown])
 
-    while selection.accepted and worse(selection.accepted) > WORSE:
+    while selection.accepted and worse(selection.accepted) > SELECTION.max_error_ratio:
         rest = [[a for a in selection.accepted if a is not c] for c in selection.accepted]
         misled = selection.accepted[int(np.argmin(data.workers.map(worse, rest)))]
         say(f"  left out again, flights are predicted worse with it: {misled.label}")

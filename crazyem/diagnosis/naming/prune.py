@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
-from crazyem.diagnosis.fitting.fit import TORQUES, Data, Fitted
+from crazyem.diagnosis.fitting.fit import Data, Fitted
 from crazyem.diagnosis.fitting.gram import used
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import (
@@ -20,16 +20,8 @@ from crazyem.diagnosis.fitting.nuisances import (
 )
 from crazyem.diagnosis.locating.random_torques import off_peak_gram, peaks
 from crazyem.diagnosis.naming.detection_limits import at_the_end
-from crazyem.diagnosis.naming.trials import LIKELY, SURE, Selection, Step, both, dispersion_of, significance, wald
-
-ADMITTED = 8.0  # nats; least evidence of an effect
-HELD_OUT_NATS = 1.0  # nats; least gain on held-out flights that can show the effect
-INFORMATIVE_NATS = 6.0  # nats; expected gain from which held-out flights can show an effect
-COST_SHARE = 0.1  # share of its gain that an effect may cost on flights that cannot show it: a hover has its own biases
-HAUSMAN_P = 0.01  # p-value of the test that an effect has the same size without the peaks of a spectrum (Hausman 1978)
-SIZE_DIFFERENCE = 1 / 3  # least difference of these sizes, as a share: sampled commands alone make some per cent
-START_FORCES = np.full(3, 0.2)  # m/s^2; start value of disturbing forces with memory
-MEMORY_NATS = 10.0  # nats; least gain by disturbances with memory
+from crazyem.diagnosis.naming.trials import Selection, Step, both, dispersion_of, significance, wald
+from crazyem.diagnosis.settings import FITTING, SELECTION
 
 
 def pruned(
@@ -76,22 +68,22 @@ def backward_elimination(
             assert step.taken is not None
             dispersion = dispersion_of(fitted, len(c.free), offset=sum(len(a.free) for a in accepted[:k]))
             gain, held = (here - less.loglik) / dispersion, (held_here - held_less) / dispersion
-            need = -max(ADMITTED, COST_SHARE * gain)
+            need = -max(SELECTION.min_evidence, SELECTION.cost_share * gain)
             # held-out flights that should bring little of the gain cannot show the effect
-            least = max(INFORMATIVE_NATS, COST_SHARE * gain) * dispersion
+            least = max(SELECTION.informative, SELECTION.cost_share * gain) * dispersion
             should = np.inf if held_out is None else expected(held_out, fitted, accepted, c)
             if should > least:
-                need = HELD_OUT_NATS
+                need = SELECTION.min_held_out
             brings = gain - len(c.free) + held
-            held_up = held + ADMITTED - need if held_out else np.inf
+            held_up = held + SELECTION.min_evidence - need if held_out else np.inf
             # an effect that no flight needs goes first: it may be why another fails on held-out flight
-            judged.append(((brings > ADMITTED, min(brings, held_up)), c, less))
+            judged.append(((brings > SELECTION.min_evidence, min(brings, held_up)), c, less))
             now = replace(
                 step.taken, gain=gain * dispersion, held_out=held * dispersion, expected=should, dispersion=dispersion
             )
             steps = [replace(s, taken=now) if s is step and held_out else s for s in steps]
         worst = min((j for j in judged if j[1] not in kept), key=lambda j: j[0], default=None)
-        if worst is None or worst[0][1] > ADMITTED:
+        if worst is None or worst[0][1] > SELECTION.min_evidence:
             break
         rest = [c for c in accepted if c is not worst[1]]
         bare_of_it = refine_base(data, worst[2].point, rest)
@@ -158,21 +150,25 @@ def without_noise_look_alikes(
     """
     while accepted:
         apart = data.twin()
-        noise = replace(fitted.point.noise, disturbance=np.concatenate([START_FORCES, TORQUES]), memory=1.0)
+        noise = replace(
+            fitted.point.noise,
+            disturbance=np.concatenate([np.full(3, FITTING.start_force), np.full(3, FITTING.start_torque)]),
+            memory=1.0,
+        )
         point = apart.fit_noise(replace(fitted.point, noise=noise))
-        if apart.loglik(point, passes=2) < data.loglik(fitted.point, passes=2) + MEMORY_NATS:
+        if apart.loglik(point, passes=2) < data.loglik(fitted.point, passes=2) + SELECTION.memory_gain:
             break
         with_memory = refine_base(apart, point, accepted, rounds=2, noise=False)
         sure, offset = [], 0
         for c in accepted:
             p_value = significance(with_memory, len(c.free), offset=offset)
-            if held_out and SURE <= p_value < LIKELY:
+            if held_out and SELECTION.p_value <= p_value < SELECTION.held_out_p_value:
                 taken = next(s.taken for s in steps if s.taken and s.taken.candidate.effect == c.effect)
                 p_value = both(p_value, held_gain(data, held_out, with_memory, accepted, c) / taken.dispersion)
             sure.append(p_value)
             offset += len(c.free)
         worst = int(np.argmax(sure))
-        if sure[worst] < SURE:
+        if sure[worst] < SELECTION.p_value:
             break
         say(f"  left out again, disturbances with memory explain it: {accepted[worst].label}")
         fitted, accepted, steps = left_out(data, fitted, accepted, steps, accepted[worst])
@@ -214,7 +210,7 @@ def vibration_look_alikes(
         covariance = beside[1].covariance[at, at]
         size, apart = here[at] + whole[1].theta[at], beside[1].theta[at] - whole[1].theta[at]
         share = float(apart @ np.linalg.pinv(covariance) @ apart) / float(size @ np.linalg.pinv(covariance) @ size)
-        if share > SIZE_DIFFERENCE**2 and wald(apart, covariance, beside[0], taken) < HAUSMAN_P:
+        if share > SELECTION.size_difference**2 and wald(apart, covariance, beside[0], taken) < SELECTION.hausman_p:
             say(f"  it has another size without the vibration: {c.label}")
             doubted.append(c.effect)
     return frozenset(doubted)

@@ -29,6 +29,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from crazyem.diagnosis.flights.inputs import samples
 from crazyem.diagnosis.locating.locate import Finding
+from crazyem.diagnosis.settings import RECORDINGS, ROTOR_RESPONSE, SELECTION
 from crazyem.physics.effects.timing import INPUT_DELAY, MOTOR_LAG
 from crazyem.physics.rotors import thrust_from_speed
 from crazyem.recordings.airborne import airtime
@@ -36,24 +37,6 @@ from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
 LAG, DELAY = MOTOR_LAG.name, INPUT_DELAY.name
-SLOW = 0.5  # Hz; slower changes come from the battery
-SPACING, FASTEST = 0.01, 0.025  # s between compared thrusts, about; s between samples, at most
-FEWEST = 400  # least number of samples
-EDGE = 0.5  # s left out at either end of a flight
-STARTS = (0.01, 0.03, 0.08)  # s; start values of the lag
-SHORTEST, LONGEST, LATEST = 2e-3, 0.5, 0.1  # s; bounds of the lag, largest delay
-INSTRUMENTS = 8  # number of earlier samples of the command, and of the thrust
-SPLINE = 2  # samples to either side of a time on which a spline mainly depends
-AROUND = (-1, 3)  # samples of the thrust about a command, from the one before it to the second after it
-# Least first-stage F statistic of the weakest direction (Cragg and Donald, 1993). In ten flights of two simulators with
-# known lags, the error is at most 5 % (rms 3 %) from 2.3 on, and up to 34 % below 1.2.
-STRONG = 2.0
-LAG_SD, DELAY_SD, TOGETHER = 0.05, 1.4e-3, -0.5  # errors beyond scatter: relative; s; correlation
-# Least power of a rotor's residual over the median power of the others, in every recording: up to 1.2 in 13
-# simulated drones, 5.5 and more in ten flights of five with a rotor that sticks within 1.4 to 5 % of full command.
-DISOBEYS = 3.0
-INDEPENDENT = 10.0  # samples for one independent residual
-ENOUGH, CLOSE = 8.0, 4.0  # nats: least gain of a finding; difference within which lag and delay are look-alikes
 
 
 @dataclass(frozen=True)
@@ -96,8 +79,8 @@ def response(found: Sequence[Answer]) -> Response | None:
     lag, delay = covariance @ sum(np.linalg.solve(r.covariance, r.best) for r in found)
     held = float(np.mean([r.held for r in found]))
     delay += held / 4.0  # held commands are half a sample late where true ones are smooth, and on time at steps
-    sd = np.array([LAG_SD * lag, np.hypot(DELAY_SD, held / np.sqrt(48.0))])
-    usual = np.outer(sd, sd) * np.array([[1.0, TOGETHER], [TOGETHER, 1.0]])
+    sd = np.array([ROTOR_RESPONSE.lag_sd * lag, np.hypot(ROTOR_RESPONSE.delay_sd, held / np.sqrt(48.0))])
+    usual = np.outer(sd, sd) * np.array([[1.0, ROTOR_RESPONSE.correlation], [ROTOR_RESPONSE.correlation, 1.0]])
     return Response(float(lag), float(delay), covariance + usual)
 
 
@@ -109,9 +92,9 @@ def disobedient(found: Sequence[Answer]) -> Finding | None:
     ratio = np.array([[p[k] / np.median(np.delete(p, k)) for k in range(4)] for p in power])
     rotor = int(np.argmax(ratio.min(axis=0)))
     least = ratio[:, rotor]
-    if least.min() < DISOBEYS:
+    if least.min() < ROTOR_RESPONSE.max_residual:
         return None
-    samples_of = np.array([r.left.shape[1] / INDEPENDENT for r in found])
+    samples_of = np.array([r.left.shape[1] / ROTOR_RESPONSE.independent for r in found])
     nats = float(np.sum(0.5 * samples_of * (least - 1.0 - np.log(least))))
     size = float(np.sqrt(power[0, rotor]))
     sd = size / float(np.sqrt(2.0 * samples_of[0]))
@@ -128,31 +111,37 @@ def _of_one(recording: Recording, vehicle: Vehicle) -> Answer | None:
         return None
     time, command = samples(recording, "motor_command")
     when, speed = samples(recording, "rotor_speed")
-    if when.size < FEWEST or time.size < FEWEST or float(np.median(np.diff(when))) > FASTEST:
+    if (
+        when.size < ROTOR_RESPONSE.min_samples
+        or time.size < ROTOR_RESPONSE.min_samples
+        or float(np.median(np.diff(when))) > ROTOR_RESPONSE.max_period
+    ):
         return None
-    begin = max(air.flown[0][0] + EDGE, when[0] + LATEST)
-    end = min(air.flown[-1][1] - EDGE, when[-1] - LATEST)
+    begin = max(air.flown[0][0] + RECORDINGS.edge, when[0] + ROTOR_RESPONSE.max_delay)
+    end = min(air.flown[-1][1] - RECORDINGS.edge, when[-1] - ROTOR_RESPONSE.max_delay)
     inside = (time > begin) & (time < end)
-    if inside.sum() < FEWEST:
+    if inside.sum() < ROTOR_RESPONSE.min_samples:
         return None
     at, wanted = time[inside], command[inside].astype(float)
     volts, known = samples(recording, "voltage")
     if volts.size > 1:  # a rotor answers to duty times voltage, and the voltage drops under load
         wanted = wanted * np.interp(at, volts, known[:, 0])[:, None]
     step = float(np.median(np.diff(at)))
-    if step > FASTEST or not np.all(np.std(wanted, axis=0) > 0):
+    if step > ROTOR_RESPONSE.max_period or not np.all(np.std(wanted, axis=0) > 0):
         return None
     thrust = CubicSpline(when, thrust_from_speed(speed, rotor_constant=vehicle.rotor_constant))
     equation = _LagEquation.of(at, wanted, thrust, step)
+    min_delay = -ROTOR_RESPONSE.spline_reach * step  # below, instruments share errors with e
     bounds = (
-        np.array([SHORTEST, -SPLINE * step]),
-        np.array([LONGEST, LATEST]),
-    )  # below, instruments share errors with e
+        np.array([ROTOR_RESPONSE.min_lag, min_delay]),
+        np.array([ROTOR_RESPONSE.max_lag, ROTOR_RESPONSE.max_delay]),
+    )
     tries = [
-        least_squares(equation.moments, [s, 0.0], bounds=bounds, x_scale=[0.01, 0.01], diff_step=1e-3) for s in STARTS
+        least_squares(equation.moments, [s, 0.0], bounds=bounds, x_scale=[0.01, 0.01], diff_step=1e-3)
+        for s in ROTOR_RESPONSE.start_lags
     ]
     best = min(tries, key=lambda t: float(t.cost))
-    if np.linalg.matrix_rank(best.jac) < 2 or equation.strength(best.x) < STRONG:
+    if np.linalg.matrix_rank(best.jac) < 2 or equation.strength(best.x) < ROTOR_RESPONSE.min_f:
         return None
     plain, _ = equation.errors(best.x)
     free = best.fun.size - best.x.size - 4 * equation.shapes.shape[2]
@@ -163,7 +152,7 @@ def _of_one(recording: Recording, vehicle: Vehicle) -> Answer | None:
 
 def _command_residuals(at: NDArray, wanted: NDArray, thrust: CubicSpline, step: float) -> NDArray:
     """(4, n) N: residuals of commands (n, 4) at times (n,) s, regressed on the thrusts around."""
-    near = thrust(at[:, None] + step * np.arange(*AROUND))  # (n, samples, 4)
+    near = thrust(at[:, None] + step * np.arange(*ROTOR_RESPONSE.near))  # (n, samples, 4)
     shapes = _high_pass(np.concatenate([near, near[:, :1] ** 2 / near.mean()], axis=1), step)
     fast, left = _high_pass(wanted, step), []
     for rotor in range(4):
@@ -200,12 +189,13 @@ class _LagEquation:
         relative = held / wanted.mean(axis=0)
         shapes = _high_pass(np.stack([relative, relative**2], 2), step)
         mean = thrust(grid).mean(axis=0)
-        steps = max(1, round(SPACING / step))
-        edge = round(EDGE / step)  # transients of the high-pass
-        row = np.arange(edge + INSTRUMENTS, grid.size - edge - steps)
-        before = np.roll(_high_pass(thrust(grid) / mean, step), SPLINE, axis=0)  # samples without influence on f(t + d)
+        steps = max(1, round(ROTOR_RESPONSE.spacing / step))
+        edge = round(RECORDINGS.edge / step)  # transients of the high-pass
+        row = np.arange(edge + ROTOR_RESPONSE.instruments, grid.size - edge - steps)
+        changes = _high_pass(thrust(grid) / mean, step)
+        before = np.roll(changes, ROTOR_RESPONSE.spline_reach, axis=0)  # samples without influence on f(t + d)
         earlier = np.concatenate([shapes[:, :, 0], before], axis=1)
-        past = np.stack([earlier[row - j] for j in range(1, INSTRUMENTS + 1)], 2)  # (m, 8, j)
+        past = np.stack([earlier[row - j] for j in range(1, ROTOR_RESPONSE.instruments + 1)], 2)  # (m, 8, j)
         instruments = [np.linalg.qr(past[:, (r, r + 4)].reshape(row.size, -1))[0] for r in range(4)]
         return cls(grid, step, steps, thrust, mean, shapes, row, np.stack(instruments))
 
@@ -239,8 +229,10 @@ class _LagEquation:
 
 
 def _high_pass(values: NDArray, step: float) -> NDArray:
-    """Values (n, ...) every `step` s without frequencies below `SLOW`."""
-    return np.asarray(sosfiltfilt(butter(2, SLOW * 2 * step, "high", output="sos"), values, axis=0))
+    """Values (n, ...) every `step` s without frequencies below `ROTOR_RESPONSE.min_frequency`."""
+    return np.asarray(
+        sosfiltfilt(butter(2, ROTOR_RESPONSE.min_frequency * 2 * step, "high", output="sos"), values, axis=0)
+    )
 
 
 @dataclass(frozen=True)
@@ -276,9 +268,9 @@ def late_response(found: Response, apart: Response | None, vehicle: Vehicle) -> 
     }
     nothing = found.nats(*file)
     name = max(alone, key=lambda n: alone[n][2])
-    if -nothing < ENOUGH:
+    if -nothing < SELECTION.min_evidence:
         return None
-    if -alone[name][2] > ENOUGH and found.delay > file[1]:
+    if -alone[name][2] > SELECTION.min_evidence and found.delay > file[1]:
         values = {LAG: (found.lag, lag_lag**0.5), DELAY: (found.delay, late_late**0.5)}
         at, nats = (found.lag, found.delay), -nothing
     else:
@@ -287,10 +279,12 @@ def late_response(found: Response, apart: Response | None, vehicle: Vehicle) -> 
         values = {name: alone[name][:2]}
         at = (lag, file[1]) if name == LAG else (file[0], delay)
         nats = alone[name][2] - nothing
-    if nats < ENOUGH:
+    if nats < SELECTION.min_evidence:
         return None
-    if apart is not None and -apart.nats(*at) > ENOUGH:
+    if apart is not None and -apart.nats(*at) > SELECTION.min_evidence:
         return None
     held = nats if apart is None else apart.nats(*at) - apart.nats(*file)
-    alike = len(values) == 1 and delay > file[1] and abs(alone[LAG][2] - alone[DELAY][2]) < CLOSE
-    return Late(values, nats, held, alike) if held > ENOUGH / 2 else None
+    alike = (
+        len(values) == 1 and delay > file[1] and abs(alone[LAG][2] - alone[DELAY][2]) < SELECTION.look_alike_difference
+    )
+    return Late(values, nats, held, alike) if held > SELECTION.min_evidence / 2 else None

@@ -31,12 +31,11 @@ from crazyem.diagnosis.fitting.nuisances import (
 from crazyem.diagnosis.naming.detection_limits import at_the_end, matters
 from crazyem.diagnosis.naming.evidence import gain_of_both, known_by, tuning
 from crazyem.diagnosis.naming.onset import date, onset_of
-from crazyem.diagnosis.naming.prune import ADMITTED, pruned
+from crazyem.diagnosis.naming.prune import pruned
 from crazyem.diagnosis.naming.starting_points import best_begun
 from crazyem.diagnosis.naming.steady import as_steady, by_onsets, without_trim_rivals
 from crazyem.diagnosis.naming.steady_odds import decided_by_balance
 from crazyem.diagnosis.naming.trials import (
-    SURE,
     Selection,
     Step,
     Trial,
@@ -50,14 +49,8 @@ from crazyem.diagnosis.naming.trials import (
     significance,
     sure_enough,
 )
+from crazyem.diagnosis.settings import SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
-
-MOST_FITTED = 6  # candidates of a turn
-GAIN_SHARE = 0.15  # least share of the largest linear gain with which a candidate is fitted
-FITTED_ANYWAY = 3  # candidates that are fitted whatever they gain
-MOST_EFFECTS = 9  # real drones differ from their file in more than one thing
-CLOSE_GAIN = 0.8  # share of the best gain from which a trial gets its own noise,
-MOST_COMPARED = 3  # at most so many
 
 
 def linear_trials(
@@ -262,7 +255,7 @@ def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Call
 
 def admitted(basis: Basis, trial: Trial) -> bool:
     """Whether a trial has the evidence and the significance to be taken."""
-    enough = separate_evidence(trial, counted=basis.held_out is not None) > ADMITTED
+    enough = separate_evidence(trial, counted=basis.held_out is not None) > SELECTION.min_evidence
     return enough and sure_enough(basis.point, trial.p_value)
 
 
@@ -292,7 +285,7 @@ def select(
         linear = linear_trials(data, point, accepted, best_begun(data, point, accepted, rest))
         if len(accepted) > first:
             steps[-1] = replace(steps[-1], beside=additions(steps[-1], [t for t, _ in linear]))
-        if len(accepted) >= MOST_EFFECTS:  # the linear trials show what stands beside the last
+        if len(accepted) >= SELECTION.max_effects:  # the linear trials show what stands beside the last
             steps.append(Step(tuple(t for t, _ in linear), None))
             break
         steps.append(step_of(Basis(data, apart, point, tuple(accepted), value, held_value), linear, say=say))
@@ -321,7 +314,7 @@ def select(
     whole = Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates))
     chosen = pruned(data, nominal_point, whole, held_out, say)
     gone = found - {c.effect for c in chosen.accepted}
-    if len(found) < MOST_EFFECTS or not gone:  # else there is room for more now
+    if len(found) < SELECTION.max_effects or not gone:  # else there is room for more now
         return chosen
     rest = [c for c in candidates if c.effect not in gone]
     return select(data, nominal_point, rest, held_out=held_out, begun=chosen, say=say)
@@ -331,15 +324,15 @@ def shortlist(linear: Sequence[tuple[Trial, Solution]]) -> list[tuple[Trial, Sol
     """The trials to be fitted: those of the largest gains and those of the largest evidence, one start of each."""
     sound = [t for t in linear if t[0].evidence > 2.0 and t[0].p_value < 0.03]
     chosen: list[tuple[Trial, Solution]] = []
-    least = GAIN_SHARE * max((t.gain for t, _ in sound), default=0.0)
+    least = SELECTION.gain_share * max((t.gain for t, _ in sound), default=0.0)
     by_gain = sorted(sound, key=lambda t: 2 * len(t[0].candidate.free) - t[0].gain)
     for entry in [x for pair in zip(by_gain, sound, strict=True) for x in pair]:
         c = entry[0].candidate
         twins = [t for t, _ in chosen if t.candidate.effect == c.effect]
         same = any(t.candidate.fixed == c.fixed and t.candidate.free == c.free for t in twins)
-        if not same and len(twins) < 2 and (entry[0].gain > least or len(chosen) < FITTED_ANYWAY):
+        if not same and len(twins) < 2 and (entry[0].gain > least or len(chosen) < SELECTION.min_fitted):
             chosen.append(entry)
-        if len(chosen) == MOST_FITTED:
+        if len(chosen) == SELECTION.max_fitted:
             break
     for name in [n for n, effect in CATALOGUE.items() if effect.twins]:
         for twin in CATALOGUE[name].twins:
@@ -380,9 +373,9 @@ def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], No
         t
         for t in trials
         if rivals(t, counted=counted)
-        and (t.value > CLOSE_GAIN * trials[0].value or (turns and CATALOGUE[t.candidate.effect].twins))
+        and (t.value > SELECTION.noise_share * trials[0].value or (turns and CATALOGUE[t.candidate.effect].twins))
     ]
-    equals += [t for t in nearly[:MOST_COMPARED] if all(t is not e for e in equals)]
+    equals += [t for t in nearly[: SELECTION.max_compared] if all(t is not e for e in equals)]
     if len(equals) == 1:
         return trials, equals
     say(f"  comparing {', '.join(t.candidate.label for t in equals)}")
@@ -410,19 +403,19 @@ def group_of(taken: Trial, equals: Sequence[Trial], trials: Sequence[Trial], *, 
 
 
 def name_of(equals: Sequence[Trial], *, counted: bool) -> Trial:
-    """The look-alike that gives the name: the simplest that no other beats (`BEATEN`).
+    """The look-alike that gives the name: the simplest that no other beats (`SELECTION.beaten`).
 
     By the scatter over blocks alone. The scatter between recordings is known from few recordings; it widens a group,
     but must not name an effect that loses by hundreds of nats.
     """
     near = [t for t in equals if t is equals[0] or not distinguishable(equals[0], t, recordings=False)]
     simplest = min(not_beaten(near), key=lambda t: (len(t.candidate.free), -t.evidence), default=equals[0])
-    return simplest if separate_evidence(simplest, counted=counted) > ADMITTED else equals[0]
+    return simplest if separate_evidence(simplest, counted=counted) > SELECTION.min_evidence else equals[0]
 
 
 def rivals(trial: Trial, *, counted: bool) -> bool:
     """Whether a fitted candidate is an explanation: significant or with the evidence to be admitted, and with positive
     evidence on all flights."""
     evidence = separate_evidence(trial, counted=counted)
-    sure = trial.p_value < SURE or (trial.p_value < 1.0 and evidence > ADMITTED)
+    sure = trial.p_value < SELECTION.p_value or (trial.p_value < 1.0 and evidence > SELECTION.min_evidence)
     return trial.fitted is not None and sure and evidence > 0

@@ -18,11 +18,8 @@ from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Column, Point
 from crazyem.diagnosis.fitting.nuisances import nuisances, with_nuisances
+from crazyem.diagnosis.settings import SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
-
-FEW = 5  # starting points that are all fitted in full; of more,
-KEPT = 2  # so many of the best peaks are
-SEEN = 50.0  # nats; least gain with which a chaotic effect is tried with its `Effect.sizes`
 
 
 def best_begun(
@@ -32,7 +29,7 @@ def best_begun(
     families: dict[tuple[object, ...], list[Candidate]] = {}
     for c in candidates:
         families.setdefault((c.effect, c.fixed, c.free), []).append(c)
-    many = [family for family in families.values() if len(family) > FEW]
+    many = [family for family in families.values() if len(family) > SELECTION.full_fits]
     if not many:
         return list(candidates)
     free = nuisances(data, point, accepted)
@@ -48,7 +45,9 @@ def best_begun(
         gains = [_gain(gram, weights, at + i) for i in range(len(family))]
         at += len(family)
         best = peaks(gains)
-        chaotic = max(gains) > SEEN and any(model.diverges(family[0].effect, point.vehicle) for model in data.models)
+        chaotic = max(gains) > SELECTION.chaos_gain and any(
+            model.diverges(family[0].effect, point.vehicle) for model in data.models
+        )
         found = larger(data, point, family) if chaotic else None
         dropped |= set(family) - ({family[i] for i in best} if found is None else set())
         added += [found] if found is not None else []
@@ -79,10 +78,10 @@ def larger(data: Data, point: Point, family: Sequence[Candidate]) -> Candidate |
 
 
 def peaks(gains: Sequence[float]) -> list[int]:
-    """Indices of the highest local maxima, `KEPT` at most, highest first."""
+    """Indices of the highest local maxima, `SELECTION.peaks` at most, highest first."""
     padded = [-np.inf, *gains, -np.inf]
     local = [i for i in range(len(gains)) if padded[i] < padded[i + 1] >= padded[i + 2]]
-    return sorted(local, key=lambda i: -gains[i])[:KEPT]
+    return sorted(local, key=lambda i: -gains[i])[: SELECTION.peaks]
 
 
 def _amplitude(candidate: Candidate, point: Point) -> Column:

@@ -19,15 +19,13 @@ from crazyem.diagnosis.fitting.days import trim_known
 from crazyem.diagnosis.fitting.fit import Data, DivergedError
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import refine_base
-from crazyem.diagnosis.naming.balance import FREE, HEAVIEST, Balance, balance_of, likely, steady
-from crazyem.diagnosis.naming.presence import LEAST_PROBABILITY, MISSING
+from crazyem.diagnosis.naming.balance import FREE, Balance, balance_of, likely, steady
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
+from crazyem.diagnosis.settings import CONFIDENCE, LOADS
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.mass_properties import ON_BOARD
 from crazyem.vehicle import Vehicle
 
-EDGE = 0.99  # largest distance of a load, as a share of the furthest place on board
-LOOK_ALIKE = 0.05  # least posterior probability of a reported look-alike
 Lack = Callable[[NDArray, Balance], NDArray]  # (numbers of an effect, balance) -> part of `lack` by the effect
 
 
@@ -55,7 +53,14 @@ def explanations(balances: Sequence[Balance]) -> dict[tuple[str, int], tuple[flo
     """
     asked: dict[tuple[str, int], tuple[Lack, list[tuple[float, float]]]] = {
         **{("rotor", r): _rotor(r - 1) for r in (1, 2, 3, 4)},
-        ("load", 0): (_load, [(0.0, HEAVIEST / (1.0 + HEAVIEST)), (-EDGE, EDGE), (-EDGE, EDGE)]),
+        ("load", 0): (
+            _load,
+            [
+                (0.0, LOADS.max_load / (1.0 + LOADS.max_load)),
+                (-LOADS.max_place, LOADS.max_place),
+                (-LOADS.max_place, LOADS.max_place),
+            ],
+        ),
         ("thrust", 0): (_thrust, [(-1.0, 1.0)]),
         ("air", 0): (_air, [(-ON_BOARD, ON_BOARD)] * 2),
     }
@@ -65,7 +70,7 @@ def explanations(balances: Sequence[Balance]) -> dict[tuple[str, int], tuple[flo
         rest = [root @ (b.lack - moves(b)) for root, b in zip(roots, balances, strict=True)]
         return sum(likely(float(r @ r), b.freedom) for r, b in zip(rest, balances, strict=True))
 
-    found = {("", 0): (np.log1p(-MISSING) + loglik(lambda b: np.zeros(4)), np.zeros(0))}
+    found = {("", 0): (np.log1p(-CONFIDENCE.file_lacks) + loglik(lambda b: np.zeros(4)), np.zeros(0))}
     for (kind, rotor), (lack, ends) in asked.items():
         starts = [np.array([0.1 * high, *(0.0 for _ in ends[1:])]) for high in (ends[0][1], 3.0 * ends[0][1])]
         best = min(
@@ -75,7 +80,7 @@ def explanations(balances: Sequence[Balance]) -> dict[tuple[str, int], tuple[flo
             ),
             key=lambda r: float(r.fun),
         )
-        prior = np.log(MISSING / sum(k == kind for k, _ in asked))
+        prior = np.log(CONFIDENCE.file_lacks / sum(k == kind for k, _ in asked))
         found[kind, rotor] = (prior - float(best.fun) - FREE[kind], best.x)
     return found
 
@@ -85,7 +90,7 @@ def steady_selection(
 ) -> Selection | None:
     """A selection that starts with a weak rotor or a load, if the balances of all flights make it probable.
 
-    None if its probability is less than `LEAST_PROBABILITY`, or if the vehicle file has no known trim.
+    None if its probability is less than `CONFIDENCE.min_probability`, or if the vehicle file has no known trim.
     """
     mine = [c for c in asked if decided_by_balance(nominal.vehicle, c)]
     if not mine:
@@ -97,7 +102,7 @@ def steady_selection(
         chance = {name: float(np.exp(weight - total)) for name, (weight, _) in found.items()}
         best = max(chance, key=lambda name: chance[name])
         candidate = next((c for c in mine if _is(c, best)), None)
-        if candidate is None or chance[best] < LEAST_PROBABILITY:
+        if candidate is None or chance[best] < CONFIDENCE.min_probability:
             return None
         say(f"by what is steady in all flights: {candidate.label} with {chance[best]:.2f}")
         before = refine_base(data.twin(), nominal, ())
@@ -113,7 +118,8 @@ def steady_selection(
     alike = tuple(
         replace(trial, candidate=other, fitted=None)
         for other in asked
-        if other.effect != candidate.effect and any(_is(other, name) and p > LOOK_ALIKE for name, p in chance.items())
+        if other.effect != candidate.effect
+        and any(_is(other, name) and p > CONFIDENCE.min_look_alike for name, p in chance.items())
     )
     step = Step((trial, *alike), trial, alike)
     return Selection(before.point, fitted.point, (step,), (candidate,), fitted, len(asked))

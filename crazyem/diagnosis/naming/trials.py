@@ -10,20 +10,12 @@ from scipy.special import expit, logit
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Fitted
-from crazyem.diagnosis.fitting.gram import MANY, Gram
+from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import solved
-from crazyem.diagnosis.naming.presence import MOST_PROBABLE, presence
+from crazyem.diagnosis.naming.presence import presence
+from crazyem.diagnosis.settings import CONFIDENCE, FITTING, SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
-
-SURE = 1e-3  # largest p-value of an effect that is taken, before candidates are counted
-SURE_DAILY = 1e-4  # the same for a file with a trim: no test by the scatter of blocks follows there (see `prune`)
-LIKELY = 5e-2  # p-value below which held-out flights may lower the p-value further (see `both`)
-CLOSE = 4.0  # nats; two explanations with a smaller difference are look-alikes
-SEPARATION = 1.64  # standard deviations of this difference; with a smaller difference they are look-alikes, too
-EVEN = 0.5  # least probability of a name beside a rival that is not significant
-BESIDE = 0.5  # share of its gain that a second effect keeps beside the first; with less it is a look-alike of the first
-BEATEN = 0.1  # probability of being the better explanation, below which a simpler effect does not give the name
 
 
 @dataclass(frozen=True)
@@ -68,10 +60,10 @@ class Trial:
     def presence(self, order: int) -> float:
         """Probability that the effect is real, as the `order`-th that was found (from 1); look-alikes aside."""
         if self.log_odds is not None:
-            return min(MOST_PROBABLE, float(expit(self.log_odds)))
+            return min(CONFIDENCE.max_probability, float(expit(self.log_odds)))
         expected = self.gain if self.expected is None else self.expected
         there = presence(self.gain / self.dispersion, self.held_out, expected, order, dispersion=self.dispersion)
-        return min(MOST_PROBABLE, float(expit(logit(there) + self.other_evidence)))
+        return min(CONFIDENCE.max_probability, float(expit(logit(there) + self.other_evidence)))
 
     @property
     def worth(self) -> float:
@@ -107,7 +99,7 @@ class Step:
 
     def _explains(self, trial: Trial) -> bool:
         better_on_all = self.taken is not None and trial.value > self.taken.value
-        return trial.p_value < SURE and (trial.evidence > 0 or better_on_all)
+        return trial.p_value < SELECTION.p_value and (trial.evidence > 0 or better_on_all)
 
 
 @dataclass(frozen=True)
@@ -165,9 +157,9 @@ def better(one: Trial, other: Trial, *, recordings: bool = True) -> float:
 
 
 def not_beaten(near: Sequence[Trial]) -> list[Trial]:
-    """The trials that no significant other beats with a probability of more than 1 - `BEATEN`."""
-    sure = [t for t in near if t.p_value < SURE]
-    return [t for t in near if all(t is o or better(t, o, recordings=False) > BEATEN for o in sure)]
+    """The trials that no significant other beats with a probability of more than 1 - `SELECTION.beaten`."""
+    sure = [t for t in near if t.p_value < SELECTION.p_value]
+    return [t for t in near if all(t is o or better(t, o, recordings=False) > SELECTION.beaten for o in sure)]
 
 
 def preferred(taken: Trial, rivals: Sequence[Trial]) -> float:
@@ -181,7 +173,9 @@ def preferred(taken: Trial, rivals: Sequence[Trial]) -> float:
     known = taken.candidate.effect == TRIM
     for rival in rivals:
         if rival.fitted is not None and rival.blocks.size == taken.blocks.size:
-            chance *= max(better(taken, rival), EVEN if known or rival.p_value >= SURE else 0.0)
+            chance *= max(
+                better(taken, rival), CONFIDENCE.min_probability if known or rival.p_value >= SELECTION.p_value else 0.0
+            )
     return chance
 
 
@@ -192,8 +186,8 @@ def scatter(differences: NDArray) -> float:
 
 
 def between(differences: NDArray, recording: NDArray) -> float:
-    """Standard deviation of the sum of differences (b,) over recordings (b,); 0 for fewer than `MANY`."""
-    if recording.size != differences.size or len(np.unique(recording)) < MANY:
+    """Standard deviation of the sum of differences (b,) over recordings (b,); 0 if they are too few for a scatter."""
+    if recording.size != differences.size or len(np.unique(recording)) < FITTING.min_flights:
         return 0.0
     total, length = np.bincount(recording, differences), np.bincount(recording)
     away = total - length * total.sum() / length.sum()
@@ -203,7 +197,7 @@ def between(differences: NDArray, recording: NDArray) -> float:
 def distinguishable(best: Trial, other: Trial, *, recordings: bool = True) -> bool:
     """Whether the flights prefer one trial: whether the other is no look-alike."""
     nats, sd = margin(best, other, recordings=recordings)
-    return nats > CLOSE and nats > SEPARATION * sd
+    return nats > SELECTION.look_alike_difference and nats > SELECTION.separation * sd
 
 
 def by_evidence(trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
@@ -216,7 +210,7 @@ def by_evidence(trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
         replace(t, evidence=(t.gain + (t.held_out if counted else 0.0)) / common - len(t.candidate.free))
         for t in trials
     ]
-    return sorted(judged, key=lambda t: (t.p_value >= SURE, -t.evidence))
+    return sorted(judged, key=lambda t: (t.p_value >= SELECTION.p_value, -t.evidence))
 
 
 def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
@@ -226,7 +220,7 @@ def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
     """
     left = {c: max(t.gain for t in later if t.candidate.effect == c) for c in {t.candidate.effect for t in later}}
     fitted = [t for t in step.trials if t.fitted is not None and t.candidate.effect in left]
-    return frozenset(t.candidate.effect for t in fitted if 0 < BESIDE * t.gain < left[t.candidate.effect])
+    return frozenset(t.candidate.effect for t in fitted if 0 < SELECTION.kept_share * t.gain < left[t.candidate.effect])
 
 
 def both(p_value: float, held: float) -> float:
@@ -234,7 +228,7 @@ def both(p_value: float, held: float) -> float:
 
     The likelihood ratio of two fixed models exceeds exp(held) by chance with a probability of at most exp(-held).
     """
-    return p_value * float(np.exp(-max(held, 0.0))) if p_value < LIKELY else p_value
+    return p_value * float(np.exp(-max(held, 0.0))) if p_value < SELECTION.held_out_p_value else p_value
 
 
 def separate_evidence(trial: Trial, *, counted: bool) -> float:
@@ -275,4 +269,4 @@ def wald(away: NDArray, covariance: NDArray, gram: Gram, columns: float) -> floa
 
 def sure_enough(point: Point, p_value: float) -> bool:
     """Whether the p-value is small enough for the effect to be taken."""
-    return p_value < (SURE_DAILY if TRIM in point.vehicle.effects else SURE)
+    return p_value < (SELECTION.daily_p_value if TRIM in point.vehicle.effects else SELECTION.p_value)

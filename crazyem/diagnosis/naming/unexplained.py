@@ -11,18 +11,12 @@ from crazyem.diagnosis.fitting.model import Point, Swept
 from crazyem.diagnosis.locating.locate import AXES, Finding, Located, strongest
 from crazyem.diagnosis.locating.random_torques import AT_RANDOM, erratic_rotor, humps, memoryless
 from crazyem.diagnosis.naming.trials import Selection
+from crazyem.diagnosis.settings import LOCATION, SPECTRUM
 from crazyem.vehicle import GRAVITY
 
-STRUCTURE = 25.0  # nats; least structure that counts as unexplained
-# Sizes that onboard filters and sampled commands leave in every flight: share of the weight, share of the weight times
-# the arm, rad, m/s.
-TOLERANCE = {"force": 0.01, "torque": 0.0004, "attitude": 5e-3, "velocity": 0.05}
-DAILY = 2.0  # factor on these sizes if trim, thrust and leaning differ by 2 % from day to day or flight to flight
-SLOWEST = 1.5  # Hz: below, onboard filters wander
-LINE = 25.0  # nats; least peak power of the spectrum over its surroundings, less the log of the number of frequencies
-SHAKEN = 0.3  # least line over the swing's change in a step (`shaking`), which an unknown torque leaves whole
+# Sizes that count, of each signal: share of the weight, share of the weight times the arm, rad, m/s.
+TOLERANCE = {name: float(getattr(LOCATION, name)) for name in ("force", "torque", "attitude", "velocity")}
 TURNING = ("torque", "body_rate")
-NEAR = 0.15  # share of the frequency range that counts as surroundings
 
 
 @dataclass(frozen=True)
@@ -87,7 +81,11 @@ def unexplained(data: Data, selection: Selection, after: Located, apart: Data | 
     filed = replace(point, effects={**point.vehicle.effects, **named})
     # body axes only: `place.py` tests forces along axes of the room, and `wind` is an effect of the catalogue
     of_the_body = [f for f in after.findings if f.axis in AXES]
-    left = [f for f in strongest(of_the_body, most=40) if f.nats > STRUCTURE and notable(f, point, differ=data.differ)]
+    left = [
+        f
+        for f in strongest(of_the_body, most=40)
+        if f.nats > LOCATION.min_structure and notable(f, point, differ=data.differ)
+    ]
     for model in data.models:
         left += lines(model.sweep(point), model.flight.time) + humps(model, filed)
         model.settle(point)
@@ -101,11 +99,11 @@ def unexplained(data: Data, selection: Selection, after: Located, apart: Data | 
 
 
 def notable(finding: Finding, point: Point, *, differ: bool = False) -> bool:
-    """Whether a finding exceeds `TOLERANCE`; times `DAILY` if flights `differ` in thrust or the file has a trim."""
+    """Whether a finding is larger than onboard filters make it; flights that `differ` in thrust or trim make more."""
     weight = point.vehicle.mass * GRAVITY
     arm = max(point.vehicle.arm) or 0.03
     size = {"force": weight, "torque": weight * arm}.get(finding.signal, 1.0)
-    daily = DAILY if differ or TRIM in point.vehicle.effects else 1.0
+    daily = LOCATION.daily if differ or TRIM in point.vehicle.effects else 1.0
     return abs(finding.effect_size) > TOLERANCE.get(finding.signal, 0.0) * daily * size
 
 
@@ -128,18 +126,18 @@ def lines(swept: Swept, time: NDArray) -> list[Finding]:
         window = np.hanning(z.size)
         power = np.abs(np.fft.rfft((z - z.mean()) * window)) ** 2
         frequency = np.fft.rfftfreq(z.size, period)
-        width = max(8, int(NEAR * power.size))
-        first = max(4, int(np.searchsorted(frequency, SLOWEST)))
+        width = max(8, int(SPECTRUM.line_surroundings * power.size))
+        first = max(4, int(np.searchsorted(frequency, SPECTRUM.min_frequency)))
         k = int(np.argmax(power[first:-1])) + first
         around = np.r_[power[max(2, k - width) : max(2, k - 3)], power[k + 4 : k + width]]
         if around.size < 16:
             continue
         ratio = float(power[k] / np.median(around) * np.log(2.0))  # over the mean of exponential powers
-        if ratio > LINE + np.log(power.size):
+        if ratio > LOCATION.min_structure + np.log(power.size):
             nats = float(ratio - np.log(power.size))
             where = f"frequency {frequency[k]:.2f} Hz"
             size = float(2 * np.sqrt(power[k]) / window.sum() * np.sqrt(np.median(swept.variance[seen, 9 + i])))
-            if size < SHAKEN * shaking(np.interp(grid, time, swept.filtered[:, 10 + i]), window, k):
+            if size < SPECTRUM.min_line_torque * shaking(np.interp(grid, time, swept.filtered[:, 10 + i]), window, k):
                 continue  # the loop swings at that frequency, and the model misses a small part of the swing
             span = (float(time[0]), float(time[-1]))
             sd = size / float(np.sqrt(max(ratio, 1.0)))

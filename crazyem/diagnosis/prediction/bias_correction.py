@@ -13,7 +13,7 @@ for every time ahead h and each axis:
 The offset is a steady torque that the model lacks. The feedback is there because unknown torques depend on the motion,
 and because the loop takes rates, tilts, velocities and positions back to its setpoints.
 
-The regression uses the flight before the start only; data older than `MEMORY` count less. Earlier flights of the drone,
+The regression uses the flight before the start only; data older than `PREDICTION.memory` count less. Earlier flights,
 if given, count as if they had just been flown. A prior shrinks everything towards the model: weight 1, the rest 0. The
 specific force, in body axes, is that of a battery or of the thrust of the day, which no file contains.
 """
@@ -24,15 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from crazyem.diagnosis.settings import PREDICTION
+
 LAGS = 10  # times ahead, up to the horizon
-MEMORY = 10.0  # s, time constant of the exponential weights of older data
-WEIGHT_SD, OFFSET_SD = 1.0, 2.0  # 1, rad/s^2: standard deviations of the priors
-# 1/s, 1/s, rad/s^2 per rad, per m/s, per (m/s)^2 and per m; times h: standard deviations of the priors of the feedback
-FEEDBACK_SD = (1.0, 2.0, 10.0, 2.0, 1.0, 1.0)
-FORCE_SD, CORRELATED = 0.5, 0.1  # m/s^2, standard deviation of the prior; s, correlation time of errors of the force
-MOST = 2.0  # largest weight; that of a right model is 1
-LEAST_TIME = 2.0  # s of flight before the rotation is corrected
-FORCE_TIME = 0.3  # s of flight before the force is; less, because a frame 3 degrees off is 0.5 m/s^2 from the start on
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +68,7 @@ class Turned:
         time: (r,) s, increasing.
         rate: (r, 3) rad/s, recorded.
         gained: (r, 3) rad/s, change by the model from a recorded row to the next one.
-        start: (r, 3, f) regressors `start` of the module at a row for each axis; f as in `FEEDBACK_SD`.
+        start: (r, 3, f) regressors `start` of the module at a row for each axis; f as in `PREDICTION.feedback_sd`.
         flying: (r,) bool, whether the step from a row to the next one counts.
         lacking: (r, 3) m/s^2, specific force that the model lacks in this step, body axes.
     """
@@ -117,16 +111,16 @@ def correction_weights(turned: Turned, starts: NDArray, *, horizon: float, befor
     for k, lag in enumerate(map(float, lags[1:]), 1):
         ends, explaining, came = _explained(turned, lag)
         at = np.searchsorted(ends, starts, "right") - 1
-        known = (at + 1) * turned.period > (LEAST_TIME if before is None else -1.0)
+        known = (at + 1) * turned.period > (PREDICTION.min_rotation_time if before is None else -1.0)
         if not known.any():
             continue
-        sd = np.array([WEIGHT_SD, OFFSET_SD * lag, *(s * lag for s in FEEDBACK_SD)])
+        sd = np.array([PREDICTION.weight_sd, PREDICTION.offset_sd * lag, *(s * lag for s in PREDICTION.feedback_sd)])
         for axis in range(3):
             found = regressed(
                 explaining[:, axis], came[:, axis], sd, max(1.0, lag / turned.period), turned.period, at[known],
                 before=None if before is None else before[k - 1, axis],
             )  # fmt: skip
-            weight[known, k, axis] = np.clip(found[:, 0], 0.0, MOST)
+            weight[known, k, axis] = np.clip(found[:, 0], 0.0, PREDICTION.max_weight)
             added[known, k, axis] = found[:, 1] + np.einsum("nf,nf->n", found[:, 2:], here[known, axis])
     weight[:, 0] = weight[:, 1]
     return Weights(lags, weight, added, lacked(turned, starts))
@@ -163,7 +157,7 @@ def regressed(
 
     before: mean products (p,) of earlier flights (see `moments`), as if just flown; a row of -1 uses them alone.
     """
-    forget, c = np.exp(-period / MEMORY), x.shape[1]
+    forget, c = np.exp(-period / PREDICTION.memory), x.shape[1]
     i, j = np.triu_indices(c)
     products = _products(x, y)
     earlier = np.zeros((1, products.shape[1])) if before is None else before[None] / (1.0 - forget)
@@ -191,23 +185,26 @@ def lacked(turned: Turned, starts: NDArray) -> NDArray:
     if not rows.size:
         return found
     value = turned.lacking[rows]
-    forget = np.exp(-turned.period / MEMORY)
+    forget = np.exp(-turned.period / PREDICTION.memory)
     count, total, squares = (
         lfilter([1.0], [1.0, -forget], v, axis=0) for v in (np.ones((rows.size, 1)), value, value**2)
     )
-    spread = np.maximum(squares / count - (total / count) ** 2, 1e-12) * max(1.0, CORRELATED / turned.period)
-    mean = total / (count + spread / FORCE_SD**2)
+    spread = np.maximum(squares / count - (total / count) ** 2, 1e-12) * max(
+        1.0, PREDICTION.force_memory / turned.period
+    )
+    mean = total / (count + spread / PREDICTION.force_sd**2)
     at = np.searchsorted(turned.time[rows] + turned.period, starts + 1e-9, "right") - 1
-    known = (at + 1) * turned.period > FORCE_TIME
+    known = (at + 1) * turned.period > PREDICTION.min_force_time
     found[known] = mean[at[known]]
     return found
 
 
 def remembered(value: NDArray, counting: NDArray, period: float) -> NDArray:
-    """(r, k): mean of the counted rows (r, k) up to each row, with smaller weights of older rows (`MEMORY`); before the
-    first counted row, the row itself."""
+    """(r, k): mean of the counted rows (r, k) up to each row; before the first counted row, the row itself.
+
+    Weights of older rows are smaller (`PREDICTION.memory`)."""
     counts = counting & np.isfinite(value).all(1)
-    forget = np.exp(-period / MEMORY)
+    forget = np.exp(-period / PREDICTION.memory)
     count = lfilter([1.0], [1.0, -forget], counts.astype(float))
     total = lfilter([1.0], [1.0, -forget], np.where(counts[:, None], value, 0.0), axis=0)
     return np.where(count[:, None] > 0.0, total / np.maximum(count, 1e-300)[:, None], value)

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.prediction.bias_correction import MEMORY, Weights, correction_weights, moments
-from crazyem.diagnosis.prediction.horizon import SPACING, UNITS, Windows, open_loop, windows
+from crazyem.diagnosis.prediction.bias_correction import Weights, correction_weights, moments
+from crazyem.diagnosis.prediction.horizon import UNITS, Windows, open_loop, windows
 from crazyem.diagnosis.prediction.predict import Recorded, recorded, turned_by
+from crazyem.diagnosis.settings import PREDICTION
 from crazyem.errors import DataError
 from crazyem.physics.rotations import quaternion_conjugate, quaternion_product
 from crazyem.recordings.recording import Recording
@@ -24,9 +25,6 @@ from crazyem.vehicle import Vehicle
 Array = NDArray[np.float64]
 BAND = 0.9  # nominal coverage of the band
 QUANTITIES = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 9), "body_rate": slice(9, 12)}
-FEWEST_STARTS = 30  # least number of errors, from which twelve spreads are estimated
-STEP = 0.01  # s, step of the integration; long, because there are hundreds of drones
-PRIOR_TIME = 1.0  # s of flight that other flights count as in the scale of errors: two horizons
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +109,10 @@ def ensemble(
     others = [_Flight.of(shown, horizon, learned[:k] + learned[k + 1 :], plain=plain) for k, shown in enumerate(flown)]
     if others:
         errors = np.concatenate([f.errors[f.complete] for f in others])
-        if len(errors) < FEWEST_STARTS:
-            raise DataError(f"{len(errors)} starts are too few to learn disturbances from (at least {FEWEST_STARTS})")
+        if len(errors) < PREDICTION.min_starts:
+            raise DataError(
+                f"{len(errors)} starts are too few to learn disturbances from (at least {PREDICTION.min_starts})"
+            )
         prior = (errors**2).mean(axis=0)
         shape = np.concatenate([(f.errors / f.scale(prior))[f.complete] for f in others])
         drawn = np.random.default_rng(seed).integers(len(shape), size=offsets.shape[:2])
@@ -144,7 +144,7 @@ class _Flight:
         weights = None
         if not plain:
             weights = correction_weights(turned_by(shown), at.times[:, 0], horizon=horizon, before=learned)
-        centre = open_loop(shown, at, weights=weights, substep=STEP)[:, -1]
+        centre = open_loop(shown, at, weights=weights, substep=PREDICTION.ensemble_step)[:, -1]
         errors = _turned(offset(at.truth[:, -1], centre), -_headings(centre))
         return _Flight(shown, at, weights, centre, errors)
 
@@ -159,7 +159,9 @@ class _Flight:
         law, own = ((v.rotor_constant, v.thrust_curve, v.thrust_max) for v in (member, shown.inputs.vehicle))
         if law != own:
             shown = recorded(recording, member)
-        found: Array = open_loop(shown, self.at, vehicle=member, weights=self.weights, substep=STEP)[:, -1]
+        found: Array = open_loop(
+            shown, self.at, vehicle=member, weights=self.weights, substep=PREDICTION.ensemble_step
+        )[:, -1]
         return found
 
     def scale(self, prior: Array) -> Array:
@@ -183,16 +185,19 @@ def error_scale(begin: Array, end: Array, errors: Array, prior: Array) -> Array:
     Args:
         begin, end: (n,) s, starts in order, and the times from which their errors are known.
         errors: (n, q); rows that are not finite are left out.
-        prior: (q,) mean square before the flight; counts as `PRIOR_TIME` of flight.
+        prior: (q,) mean square before the flight; counts as `PREDICTION.prior_time` of flight.
 
-    Returns: (n, q) root mean square with smaller weights of older errors (`MEMORY`).
+    Returns: (n, q) root mean square with smaller weights of older errors (`PREDICTION.memory`).
     """
     whole = np.asarray(np.isfinite(errors).all(axis=1))
-    span = np.diff(begin, append=begin[-1:] + SPACING).clip(0.0, SPACING)  # s of flight of each start
+    apart = np.diff(begin, append=begin[-1:] + PREDICTION.spacing)
+    span = apart.clip(0.0, PREDICTION.spacing)  # s of flight of each start
     ago = begin[:, None] - end
-    weight = np.where((ago >= 0.0) & whole, span * np.exp(-np.maximum(ago, 0.0) / MEMORY), 0.0)
+    weight = np.where((ago >= 0.0) & whole, span * np.exp(-np.maximum(ago, 0.0) / PREDICTION.memory), 0.0)
     square = weight @ np.where(whole[:, None], errors, 0.0) ** 2
-    found: Array = np.sqrt((PRIOR_TIME * prior + square) / (PRIOR_TIME + weight.sum(axis=1, keepdims=True)))
+    found: Array = np.sqrt(
+        (PREDICTION.prior_time * prior + square) / (PREDICTION.prior_time + weight.sum(axis=1, keepdims=True))
+    )
     return found
 
 

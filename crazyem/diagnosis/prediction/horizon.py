@@ -12,22 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.diagnosis.flights.flight import COLUMNS
 from crazyem.diagnosis.prediction.bias_correction import Weights
-from crazyem.diagnosis.prediction.predict import SAME, Recorded, start_rows
-from crazyem.diagnosis.prediction.simulate import SUBSTEP, Simulator
+from crazyem.diagnosis.prediction.predict import Recorded, start_rows
+from crazyem.diagnosis.prediction.simulate import Simulator
+from crazyem.diagnosis.settings import PREDICTION, RECORDINGS
 from crazyem.errors import DataError
 from crazyem.physics.effects.effect import Effects
 from crazyem.physics.rotations import quaternion_conjugate, quaternion_product
 from crazyem.vehicle import Vehicle
 
 HORIZONS = (0.01, 0.1, 0.5)  # s
-SPACING = 0.1  # s between starts
-NEAR = 0.025  # s, longest interval between two samples for an interpolated truth
-BEYOND_CHANCE = 2.0  # standard errors of a mean difference of squared errors, above which a model predicts worse
-VISIBLE = 1.005  # least ratio of rms errors of a worse model; with less, they are equal in whole per cent
-FEWEST = 5  # least number of windows without overlap for a standard error
 UNITS = {"position": "m", "velocity": "m/s", "attitude": "rad", "body_rate": "rad/s"}
-_COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 
 
 @dataclass(frozen=True)
@@ -91,7 +87,7 @@ def windows(
     shown: Recorded,
     *,
     horizons: Sequence[float] = HORIZONS,
-    spacing: float = SPACING,
+    spacing: float = PREDICTION.spacing,
     within: Sequence[tuple[float, float]] | None = None,
 ) -> Windows:
     """The starts of open-loop runs and the recorded states at their ends.
@@ -115,7 +111,7 @@ def windows(
     good &= (np.diff(at, axis=1) > 0).all(axis=1) & (at[:, -1] < shown.time.size)
     age = shown.age[rows]
     if good.any():  # fresh states only; if streams never coincide, states of usual age
-        good &= age <= max(SAME, float(np.median(age[good])) + SAME)
+        good &= age <= max(RECORDINGS.same_time, float(np.median(age[good])) + RECORDINGS.same_time)
     if not good.any():
         raise DataError(
             f"{shown.path}: no stretch of flight is long enough for {horizons[-1]:g} s of open-loop simulation"
@@ -134,7 +130,7 @@ def open_loop(
     effects: Effects | None = None,
     measured_attitude: bool = False,
     weights: Weights | None = None,
-    substep: float = SUBSTEP,
+    substep: float = PREDICTION.substep,
 ) -> NDArray:
     """(n, h, 13) predictions for windows.
 
@@ -164,7 +160,7 @@ def error_lengths(prediction: NDArray, at: Windows) -> dict[str, NDArray]:
     """Quantity -> (n, h) lengths of the errors of predictions (n, h, 13); NaN where not measured, inf where the model
     left the range of numbers."""
     found = {}
-    for name, columns in _COLUMNS.items():
+    for name, columns in COLUMNS.items():
         length = lengths(prediction[..., columns], at.truth[..., columns], attitude=name == "attitude")
         known = np.isfinite(at.truth[..., columns]).all(axis=2)
         found[name] = np.where(known, np.where(np.isfinite(length), length, np.inf), np.nan)
@@ -186,7 +182,7 @@ def worse(pairs: Sequence[tuple[Mapping[str, NDArray], Mapping[str, NDArray]]]) 
 
     Args:
         pairs: `error_lengths` (n, h) of the model before and after, one pair a flight, at `HORIZONS` from starts every
-            `SPACING`.
+            `PREDICTION.spacing`.
     """
     found = []
     for name in UNITS if pairs else ():
@@ -194,8 +190,8 @@ def worse(pairs: Sequence[tuple[Mapping[str, NDArray], Mapping[str, NDArray]]]) 
             squares = [(np.square(before[name][:, k]), np.square(after[name][:, k])) for before, after in pairs]
             first, second = (np.concatenate([s[i] for s in squares]) for i in (0, 1))
             grown = [after - before for before, after in squares]
-            sigmas = _standard_errors(grown, max(1, math.ceil(horizon / SPACING - 1e-9)))
-            if sigmas > BEYOND_CHANCE and _mean(second) > VISIBLE**2 * _mean(first):
+            sigmas = _standard_errors(grown, max(1, math.ceil(horizon / PREDICTION.spacing - 1e-9)))
+            if sigmas > PREDICTION.beyond_chance and _mean(second) > PREDICTION.min_ratio**2 * _mean(first):
                 found.append(Worse(name, horizon, sigmas))
     return tuple(found)
 
@@ -209,7 +205,7 @@ def _standard_errors(differences: Sequence[NDArray], overlapping: int) -> float:
         means += [float(known[i : i + overlapping].mean()) for i in range(0, known.size, overlapping)]
     if any(math.isinf(m) for m in means):
         return math.inf
-    if len(means) < FEWEST:
+    if len(means) < PREDICTION.min_windows:
         return 0.0
     error = float(np.std(means, ddof=1)) / math.sqrt(len(means))
     return float(np.mean(means)) / error if error > 0.0 else 0.0
@@ -233,9 +229,9 @@ def lengths(prediction: NDArray, truth: NDArray, *, attitude: bool) -> NDArray:
 
 
 def recorded_at(shown: Recorded, time: NDArray) -> NDArray:
-    """(n, 13) recorded states at (n,) s: samples, or interpolated between two samples at most `NEAR` apart."""
+    """(n, 13) recorded states at (n,) s: samples, or interpolated between samples that are close enough."""
     found = np.full((time.size, 13), np.nan)
-    for name, columns in _COLUMNS.items():
+    for name, columns in COLUMNS.items():
         when, value = shown.parts[name]
         if when.size < 2:
             continue
@@ -250,7 +246,11 @@ def recorded_at(shown: Recorded, time: NDArray) -> NDArray:
         if name == "attitude":
             mixed = mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
         there = np.minimum(np.abs(time - when[before]), np.abs(time - when[after])) < 1e-6
-        inside = (gap <= NEAR) & (time >= when[before] - SAME) & (time <= when[after] + SAME)
+        inside = (
+            (gap <= PREDICTION.max_period)
+            & (time >= when[before] - RECORDINGS.same_time)
+            & (time <= when[after] + RECORDINGS.same_time)
+        )
         known = there | inside
         found[known, columns] = mixed[known]
     return found

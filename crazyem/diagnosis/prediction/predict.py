@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.diagnosis.flights.flight import COLUMNS
 from crazyem.diagnosis.flights.inputs import Inputs, inputs_of
-from crazyem.diagnosis.flights.level import LOOKS
 from crazyem.diagnosis.prediction.bias_correction import Turned, correction_weights, remembered
 from crazyem.diagnosis.prediction.simulate import Simulator
+from crazyem.diagnosis.settings import LEVELLING, PREDICTION, RECORDINGS
 from crazyem.errors import DataError
 from crazyem.notebook import finite, html_table, new_figure, saved
 from crazyem.physics.rotations import quaternion_from_euler, rotation_matrix
@@ -29,11 +30,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NAMES = ("x", "y", "z", "vx", "vy", "vz", "qx", "qy", "qz", "qw", "wx", "wy", "wz")
-SAME = 1.5e-3  # s; closer samples count as simultaneous
-OLDEST = 0.05  # s, largest age of a part of the state at a start
-MAX_GAP = 0.1  # s, longest time without inputs
-CHUNK = 2048  # starts that are integrated together, to limit memory
-_PARTS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +166,7 @@ def recorded(recording: Recording, vehicle: Vehicle) -> Recorded:
         raise DataError(f"{recording.path}: fewer than two positions, so there is nothing to predict")
     state, age = np.full((time.size, 13), np.nan), np.zeros(time.size)
     parts: dict[str, tuple[NDArray, NDArray]] = {}
-    for name, columns in _PARTS.items():
+    for name, columns in COLUMNS.items():
         when, value = ordered(arrays[name])
         if name == "attitude":
             norm = np.linalg.norm(value, axis=1, keepdims=True)
@@ -179,11 +175,11 @@ def recorded(recording: Recording, vehicle: Vehicle) -> Recorded:
         parts[name] = when, value
         at = np.searchsorted(when, time + 1e-9, "right") - 1
         since = np.where(at >= 0, time - when[np.maximum(at, 0)], np.inf) if when.size else np.full(time.size, np.inf)
-        known = since <= OLDEST
+        known = since <= PREDICTION.oldest
         state[known, columns] = value[at[known]]
         age = np.maximum(age, np.maximum(since, 0.0))
     flights = flight.flown
-    looks = () if inputs.level is None else (0.0, *LOOKS)
+    looks = () if inputs.level is None else (0.0, *LEVELLING.looks)
     before = tuple(inputs_of(recording, vehicle, flight=flight, until=inputs.took_off + s) for s in looks)
     return Recorded(recording.path, time, state, age, row, inside(time, flights), inputs, parts, flights, before)
 
@@ -192,7 +188,7 @@ def _state_signals(recording: Recording) -> dict[str, SignalArray]:
     """Signals of position, velocity, attitude and rate: the signal of that name, else another of the same quantity;
     for the attitude also Euler angles."""
     found = {}
-    for name in _PARTS:
+    for name in COLUMNS:
         wanted = [name, *(n for n in recording.signals if n.startswith(f"{name}@"))]
         array = next((recording.signals[n] for n in wanted if n in recording.signals), None)
         if array is None and name == "attitude" and "euler" in recording.signals:
@@ -207,7 +203,7 @@ def _state_signals(recording: Recording) -> dict[str, SignalArray]:
             )
         if array is not None and array.time.size:
             found[name] = array
-    missing = [name for name in _PARTS if name not in found]
+    missing = [name for name in COLUMNS if name not in found]
     if missing:
         raise DataError(
             f"{recording.path}: the recording has no {' and no '.join(missing)}; a prediction needs a whole state to "
@@ -257,7 +253,7 @@ def predict(
         simulator = Simulator(known.inputs)
         swings = simulator.swings(known.time, known.state, known.airborne)
         at = 0
-        for part in _parts(those, max(1, min(CHUNK, 2_000_000 // horizon))):
+        for part in _parts(those, max(1, min(PREDICTION.chunk, 2_000_000 // horizon))):
             grid = _times(known, part, horizon=horizon, step=step)
             swing = None if swings is None else swings[part]
             believed = None if weights is None else weights.of(slice(at, at + part.size))
@@ -291,8 +287,8 @@ def turned_by(shown: Recorded) -> Turned:
     flying = np.zeros(shown.time.size, bool)
     rows = np.arange(shown.time.size - 1)
     rows = rows[np.isfinite(shown.state[rows]).all(axis=1) & shown.airborne[rows] & shown.airborne[rows + 1]]
-    rows = rows[start_rows(shown, rows, horizon=1, step=None) & (np.diff(shown.time)[rows] < MAX_GAP)]
-    for part in _parts(rows, CHUNK):
+    rows = rows[start_rows(shown, rows, horizon=1, step=None) & (np.diff(shown.time)[rows] < RECORDINGS.max_gap)]
+    for part in _parts(rows, PREDICTION.chunk):
         grid = shown.time[part[:, None] + np.arange(2)]
         ahead = simulator.run(shown.state[part], grid, swing=None if swings is None else swings[part])
         gained[part] = ahead[:, 0, 10:13] - shown.state[part, 10:13]
@@ -331,8 +327,8 @@ def start_rows(shown: Recorded, rows: NDArray, *, horizon: int, step: float | No
         end, before = begin + horizon * step, begin + (horizon - 1) * step
         good &= end <= max(shown.time[-1], stamps[-1]) + 1e-6
     good &= begin >= stamps[0] - 1e-9
-    good &= before - stamps[np.maximum(np.searchsorted(stamps, before + 1e-9, "right") - 1, 0)] <= MAX_GAP
-    for gap in np.flatnonzero(np.diff(stamps) > MAX_GAP):
+    good &= before - stamps[np.maximum(np.searchsorted(stamps, before + 1e-9, "right") - 1, 0)] <= RECORDINGS.max_gap
+    for gap in np.flatnonzero(np.diff(stamps) > RECORDINGS.max_gap):
         good &= (end <= stamps[gap]) | (begin >= stamps[gap + 1])
     return good
 

@@ -1,7 +1,7 @@
 """Open-loop simulation of many starts at once: a rigid body with effects, driven by recorded inputs.
 
-Integration is by the explicit midpoint rule, with sub-steps of at most `SUBSTEP`. The mean thrust over each is exact
-for a lag between commands. Start states and predicted states are as a recording shows them: effects on sensors
+Integration is by the explicit midpoint rule, with sub-steps of at most `PREDICTION.substep`. The mean thrust over each
+is exact for a lag between commands. Start states and predicted states are as a recording shows them: effects on sensors
 (misalignment, velocity scale, bias, delay) are removed from the start state and added to every predicted one.
 """
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.flights.inputs import Inputs
 from crazyem.diagnosis.prediction.bias_correction import Weights
 from crazyem.diagnosis.prediction.course import ThrustCourse
+from crazyem.diagnosis.settings import PREDICTION
 from crazyem.physics.effects.effect import LONGEST_STEP, Effects, Situation
 from crazyem.physics.effects.external_force import WIND
 from crazyem.physics.effects.onboard_estimate import MEMORY_SECONDS, disturbs_attitude
@@ -27,10 +28,6 @@ from crazyem.physics.rotations import (
     rotation_matrix,
 )
 from crazyem.vehicle import GRAVITY, Vehicle
-
-SUBSTEP = 5e-3  # s, largest step of the integration
-BACK = 5e-3  # s between the rows of a path before a start
-LEAST_UNREST = 2e-3  # m/s^2 sqrt(s), least noise of a force seen in a recording
 
 
 @dataclass
@@ -139,7 +136,12 @@ class Simulator:
         bend = np.diff((seen - free)[rows], n=2, axis=0)  # the pull of a load is nearly linear over three rows
         noise = np.sqrt(np.median(gap[rows])) * np.median(np.abs(bend), axis=0) / (0.6745 * np.sqrt(6.0))
         return watched_along(
-            **hanging, share=share, rotation=rotation, free=free, shown=seen, noise=np.maximum(noise, LEAST_UNREST)
+            **hanging,
+            share=share,
+            rotation=rotation,
+            free=free,
+            shown=seen,
+            noise=np.maximum(noise, PREDICTION.min_unrest),
         )
 
     def _forces(self, time: NDArray, state: NDArray, rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
@@ -166,7 +168,7 @@ class Simulator:
         swing: NDArray | None = None,
         attitude: Callable[[NDArray], tuple[NDArray, NDArray]] | None = None,
         given: NDArray | None = None,
-        substep: float = SUBSTEP,
+        substep: float = PREDICTION.substep,
         weights: Weights | None = None,
     ) -> NDArray:
         """Predicted states at times[:, 1:].
@@ -295,11 +297,11 @@ class Simulator:
 
     def _led_to(self, body: _Body, time: NDArray, known: NDArray) -> list[_Row]:
         """The path to a state by integration back in time, oldest row first; the state itself is the last row."""
-        count = int(np.ceil(self._looks_back / BACK)) + 1
+        count = int(np.ceil(self._looks_back / PREDICTION.back)) + 1
         rows = []
         for j in range(count):
-            now = time - BACK * j
-            before, moved, situation = self._step(body, now, now - BACK, known)
+            now = time - PREDICTION.back * j
+            before, moved, situation = self._step(body, now, now - PREDICTION.back, known)
             rows.append(_Row(body, moved, replace(situation, time=now)))
             body = before
         return rows[::-1]

@@ -14,12 +14,10 @@ from crazyem.diagnosis.report.quantities import (
     table,
     tables,
 )
+from crazyem.diagnosis.settings import CONFIDENCE
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Parameter
 
-# Confidence below which an effect outside all groups is called the nearest explanation, not missing. Of 18 such
-# effects in 1899 simulated drones (seeds 2038 to 2043) two are right.
-IMPROBABLE = 0.1
 QUANTITIES = ("position", "velocity", "attitude", "body_rate")
 JUDGES = (("held_out", "on flight it has not seen"), ("train", "on the flight it was fitted to"))
 Document = Mapping[str, Any]
@@ -135,7 +133,7 @@ def _judge(document: Document) -> tuple[Mapping[str, Any], str]:
 def _hardly(effect: Mapping[str, Any], groups: Iterable[Sequence[str]]) -> bool:
     """Whether an effect outside all groups is improbable, so that it must not be called missing."""
     sure = number(effect.get("confidence"))
-    return sure is not None and sure < IMPROBABLE and not any(effect.get("name") in g for g in groups)
+    return sure is not None and sure < CONFIDENCE.improbable and not any(effect.get("name") in g for g in groups)
 
 
 def _named(effect: Mapping[str, Any], groups: Iterable[Sequence[str]]) -> str:
