@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, remembering_anew
+from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, with_torque_memory_refit
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.recordings.contents import ReadOptions
@@ -45,7 +45,7 @@ def ideal_nats(
     if _beyond(effects, seen):
         return None
     data = Data([flight_of(seen, vehicle)])
-    without = _best(data, nominal(data, Point(vehicle, known_effects(vehicle), first_guess())), ())
+    without = _best(data, nominal(data, Point(vehicle, known_effects(vehicle), start_noise())), ())
     return _under(data, without.point, effects) - without.loglik
 
 
@@ -58,7 +58,7 @@ def ideal_nats_of_each(
     if _beyond(effects, seen):
         return dict.fromkeys(effects)
     data = Data([flight_of(seen, vehicle)])
-    start = _best(data, nominal(data, Point(vehicle, known_effects(vehicle), first_guess())), ()).point
+    start = _best(data, nominal(data, Point(vehicle, known_effects(vehicle), start_noise())), ()).point
     whole = _under(data, start, effects)
     return {
         name: whole - _under(data, start, {other: table for other, table in effects.items() if other != name})
@@ -93,7 +93,7 @@ def _best(data: Data, point: Point, hidden: Iterable[str]) -> Fitted:
     such as the trim of the day."""
     known = [Candidate(name, (), ()) for name in hidden]
     once = refine_base(data, point, known)
-    again = refine_base(data, remembering_anew(data, once.point), known)
+    again = refine_base(data, with_torque_memory_refit(data, once.point), known)
     return max(once, again, key=lambda f: f.loglik)
 
 

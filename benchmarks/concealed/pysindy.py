@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from crazyem.diagnosis.fitting.model import Model, Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.registry import open_recording
@@ -44,7 +44,7 @@ def residuals(recording: Path, vehicle: Vehicle) -> tuple[NDArray, dict[str, NDA
     """(n, 6) residuals of the nominal model (m/s^2, rad/s^2, body); terms (n, 3) of force and of torque."""
     flight = flight_of(open_recording(str(recording)), vehicle)
     model = Model(flight)
-    point = Point(vehicle, {}, first_guess())
+    point = Point(vehicle, {}, start_noise())
     accelerations, situation = model.accelerations(point)
     use = np.all(np.isfinite(flight.y), axis=1)
     rotation = rotation_matrix(flight.y[use, 6:10])

@@ -8,31 +8,36 @@ from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate, candid
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.fit import nominal as nominal_of
 from crazyem.diagnosis.fitting.model import Point, deviations
-from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.fitting.nuisances import abstained, differing, unlike_a_body, with_trim_noise
-from crazyem.diagnosis.fitting.sampling import of_a_real_drone
+from crazyem.diagnosis.fitting.noise import start_noise
+from crazyem.diagnosis.fitting.nuisances import (
+    is_nonphysical,
+    with_thrust_scales,
+    with_trim_noise,
+    without_unobservable,
+)
+from crazyem.diagnosis.fitting.sampling import with_zero_trim
 from crazyem.diagnosis.flights import held_out as held_out_roles
 from crazyem.diagnosis.flights.flight import Flight, flight_of
-from crazyem.diagnosis.flights.floor import on_one_floor
-from crazyem.diagnosis.flights.frame import alike as in_one_frame
-from crazyem.diagnosis.flights.recording_nuisances import RecordingNuisances, owned
+from crazyem.diagnosis.flights.floor import with_common_floor
+from crazyem.diagnosis.flights.frame import in_mean_frame
+from crazyem.diagnosis.flights.recording_nuisances import RecordingNuisances, nuisances_of_recordings
 from crazyem.diagnosis.locating.heading import heading_by_place
 from crazyem.diagnosis.locating.locate import Located, locate
 from crazyem.diagnosis.locating.place import depends_on_place
-from crazyem.diagnosis.naming.alternatives import exchanged, named_again
+from crazyem.diagnosis.naming.alternatives import with_better_rivals, with_replacement
 from crazyem.diagnosis.naming.answer import Answer, answer_of, strongest_first
-from crazyem.diagnosis.naming.balance import by_balance, hidden_by_the_day
+from crazyem.diagnosis.naming.balance import by_balance, hidden_by_daily_variation
 from crazyem.diagnosis.naming.corroboration import false_speed, late_measurements
 from crazyem.diagnosis.naming.determined import determined, without_undetermined
 from crazyem.diagnosis.naming.free import Free, left_free
-from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, as_load, as_two
+from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, load_against_rotors, rotors_against_load
 from crazyem.diagnosis.naming.named import Named
 from crazyem.diagnosis.naming.other_likelihoods import late_rotors, other_likelihoods
 from crazyem.diagnosis.naming.place_rivals import by_place
-from crazyem.diagnosis.naming.prediction_check import with_found, without_what_misleads
-from crazyem.diagnosis.naming.rotor_response import answers, disobedient
+from crazyem.diagnosis.naming.prediction_check import with_accepted_effects, without_worse_predictions
+from crazyem.diagnosis.naming.rotor_response import answers, unresponsive_rotor
 from crazyem.diagnosis.naming.select import select
-from crazyem.diagnosis.naming.steady import left_as_trim, with_exact_torques, with_its_thrust
+from crazyem.diagnosis.naming.steady import with_exact_torques, with_its_thrust, with_remaining_trim
 from crazyem.diagnosis.naming.steady_odds import steady_selection
 from crazyem.diagnosis.naming.trials import Selection, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained, unexplained
@@ -110,7 +115,7 @@ def diagnose(
     selection, corroborated = _corroborated(data, apart, selection, asked.recordings)
     selection, balance = by_balance(data, with_exact_torques(data, selection))
     judges = asked.held_out or asked.recordings
-    selection = without_what_misleads(data, selection, asked.vehicle, judges, withhold=withhold, say=say)
+    selection = without_worse_predictions(data, selection, asked.vehicle, judges, withhold=withhold, say=say)
     besides = {c.effect for c in asked.besides}
     selection, balance, unsure = without_undetermined(data, selection, balance, say, besides=besides)
     before, after = _located(data, selection, say)
@@ -118,7 +123,7 @@ def diagnose(
     remains = unexplained(data, selection, after, apart)
     for finding in (pull, place and place.finding, heading_by_place(data, apart)):
         remains = remains.with_finding(finding) if finding else remains
-    left_out = {**chosen.left_out, **hidden_by_the_day(data, selection, chosen.candidates)}
+    left_out = {**chosen.left_out, **hidden_by_daily_variation(data, selection, chosen.candidates)}
     pulled = pull is not None or (place is not None and not place.pushed)
     beside = other_likelihoods(data, apart, selection.final, remains, wanted, left_out, pulled, say)
     if any(CATALOGUE[e.name].random for e in beside):
@@ -133,7 +138,9 @@ def diagnose(
     as_flown = _with_effects(asked.vehicle, selection, [e for e in effects if any(e.name == b.name for b in beside)])
     as_flown = with_its_thrust(as_flown, data, selection.final, selection.accepted)
     as_flown = _restored(
-        left_as_trim(chosen.asked.flights, as_flown, remains, workers), asked.vehicle, impossible.keys() - besides
+        with_remaining_trim(chosen.asked.flights, as_flown, remains, workers),
+        asked.vehicle,
+        impossible.keys() - besides,
     )
     of_recordings = {e.fitted_as or e.name for e in effects if e.of_recording}
     for name, reason in {**unsure, **impossible}.items():
@@ -155,7 +162,7 @@ def diagnose(
         left_out={n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)},
         explained=remains.explained,
         free=left_free(selection.fitted),
-        own=owned(chosen.asked.flights, chosen.asked.kept_apart, _strengths(selection)),
+        own=nuisances_of_recordings(chosen.asked.flights, chosen.asked.kept_apart, _strengths(selection)),
         swapped=asked.swapped,
     )
 
@@ -204,9 +211,9 @@ def _request_of(
     if swapped:
         flights, kept_apart, recordings, held_out = kept_apart, flights, held_out, recordings
         say(held_out_roles.swap_sentence([r.path for r in recordings], [r.path for r in held_out]))
-    assumed = of_a_real_drone(flights, vehicle)
+    assumed = with_zero_trim(flights, vehicle)
     untrimmed = assumed is not vehicle and not wanted  # then the trim is a candidate, too
-    flights, kept_apart = differing(*in_one_frame(*on_one_floor(flights, kept_apart)), assumed)
+    flights, kept_apart = with_thrust_scales(*in_mean_frame(*with_common_floor(flights, kept_apart)), assumed)
     besides = [Candidate(TRIM, (), ("x", "y", "z"))] if untrimmed else []
     return _Request(recordings, held_out, flights, kept_apart, assumed, wanted, besides, swapped)
 
@@ -214,15 +221,15 @@ def _request_of(
 def _chosen(asked: _Request, workers: Workers, say: Say) -> _Chosen:
     """The selection of effects, with final names and with effects that are needed beside these.
 
-    If the result is no physical rigid body (`unlike_a_body`), the selection is repeated without fast effects.
+    If the result is no physical rigid body (`is_nonphysical`), the selection is repeated without fast effects.
     """
     chosen = _selected(asked, workers, say)
-    deaf = unlike_a_body(chosen.selection.final, chosen.selection.accepted)
+    deaf = is_nonphysical(chosen.selection.final, chosen.selection.accepted)
     if deaf and not any(f.coarse for f in asked.flights):
         say("the turning does not follow the commands as they were recorded: once more without what is fast")
         flights, kept_apart = ([replace(f, coarse=True) for f in part] for part in (asked.flights, asked.kept_apart))
         chosen = _selected(replace(asked, flights=flights, kept_apart=kept_apart), workers, say)
-    selection = named_again(chosen.data, chosen.apart, chosen.selection, say)
+    selection = with_better_rivals(chosen.data, chosen.apart, chosen.selection, say)
     if {c.effect for c in selection.accepted} != {c.effect for c in chosen.selection.accepted}:
         # beside the new effect, others may be significant
         selection = select(
@@ -235,7 +242,7 @@ def _selected(asked: _Request, workers: Workers, say: Say) -> _Chosen:
     """The selection from all candidates that the flights can show."""
     data, apart = Data(asked.flights, workers), Data(asked.kept_apart, workers) if asked.kept_apart else None
     vehicle = asked.vehicle
-    bare = Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, first_guess())
+    bare = Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, start_noise())
     nominal = nominal_of(data, bare)
     if apart:
         apart.settle(nominal)
@@ -244,7 +251,7 @@ def _selected(asked: _Request, workers: Workers, say: Say) -> _Chosen:
     candidates, left_out = candidates_for(
         nominal, data.signals, measured_speeds=asked.flights[0].inputs.measured, wanted=asked.wanted
     )
-    candidates, left_out = abstained(data, nominal, [*candidates, *asked.besides], left_out)
+    candidates, left_out = without_unobservable(data, nominal, [*candidates, *asked.besides], left_out)
     nominal = with_trim_noise(data, nominal)
     begun = steady_selection(data, apart, nominal, candidates, say)
     selection = select(data, nominal, candidates, held_out=apart, begun=begun, say=say)
@@ -273,9 +280,9 @@ def _advice(texts: Sequence[str], recordings: Sequence[Recording]) -> tuple[str,
 def _in_place(data: Data, apart: Data | None, selection: Selection) -> dict[str, tuple[Trial, Trial] | None]:
     """For a load and for weaker rotors: the trials of this effect and of its alternative."""
     return {
-        LOAD: as_two(data, apart, selection),
+        LOAD: load_against_rotors(data, apart, selection),
         # only torques distinguish weaker rotors from a load
-        WEAKER.effect: None if data.coarse else as_load(data, apart, selection),
+        WEAKER.effect: None if data.coarse else rotors_against_load(data, apart, selection),
     }
 
 
@@ -285,7 +292,7 @@ def _late_rotors(
     """The answer, further effects and the unexplained, from the response of measured rotor speeds to commands."""
     here, there = answers(asked.recordings, vehicle), answers(asked.held_out, vehicle)
     # the body follows the measured speeds, so its effects stay as they are
-    deaf = disobedient([*here, *there])
+    deaf = unresponsive_rotor([*here, *there])
     remains = remains.with_finding(deaf) if deaf else remains
     if any(e.name == INPUT_DELAY.name for e in answer.effects):
         return answer, [], remains
@@ -315,7 +322,7 @@ def _corroborated(
             if nats is not None and abs(nats) > SELECTION.separating:
                 corroborated |= {candidate.effect, other.effect}
                 if nats > 0:
-                    selection = exchanged(data, selection, candidate, other, [start])
+                    selection = with_replacement(data, selection, candidate, other, [start])
             weak = candidate.effect == WEAK
             for_sensor = (nats or 0.0) if weak else -(nats or 0.0)
             if for_sensor > (SELECTION.separating if weak else 0.0):
@@ -348,7 +355,7 @@ def _strengths(selection: Selection) -> dict[str, float]:
 
 def _with_effects(vehicle: Vehicle, selection: Selection, beside: Sequence[Named]) -> Vehicle:
     """The vehicle with the found effects; normal delays are left out."""
-    fitted = with_found(vehicle, selection, selection.accepted)
+    fitted = with_accepted_effects(vehicle, selection, selection.accepted)
     return replace(
         fitted,
         effects={**fitted.effects, **{e.name: {n: v.value for n, v in e.parameters.items()} for e in beside}},

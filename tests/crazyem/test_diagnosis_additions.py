@@ -10,12 +10,12 @@ from closed_loop import DRONE
 
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.naming import select
 from crazyem.diagnosis.naming.trials import Step, Trial, additions
 from crazyem.diagnosis.workers import Workers
 
-POINT = Point(DRONE, {}, first_guess())
+POINT = Point(DRONE, {}, start_noise())
 
 
 def trial(effect: str, gain: float, *, fitted: bool = True, fixed: tuple[tuple[str, object], ...] = ()) -> Trial:
@@ -74,7 +74,7 @@ def test_what_explains_nearly_as_much_is_compared_with_noise_of_its_own(monkeypa
         replace(trial(effect, gain), value=gain, blocks=np.full(20, gain / 20))
         for effect, gain in (("torque_scale", 1200.0), ("inertia", 1100.0), ("wind", 900.0))  # wind: 0.75 of the best
     ]
-    trials, equals = select.compared_again(basis, first, say=lambda text: None)
+    trials, equals = select.compared_with_refitted_noise(basis, first, say=lambda text: None)
     assert [t.candidate.effect for t in equals] == ["inertia"]
     assert {t.candidate.effect: t.value for t in trials} == {"inertia": 2100.0, "torque_scale": 2000.0, "wind": 900.0}
 
@@ -96,5 +96,5 @@ def test_what_turns_the_drone_as_well_is_compared_with_noise_of_its_own_however_
         replace(trial(effect, gain), value=gain, blocks=np.full(20, gain / 20))
         for effect, gain in (("motor_lag", 40.0), (other, 15.0))
     ]
-    select.compared_again(basis, first, say=lambda text: None)
+    select.compared_with_refitted_noise(basis, first, say=lambda text: None)
     assert asked == (["motor_lag", other] if compared else [])

@@ -15,14 +15,14 @@ from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import COARSE_REASON, refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.locating.random_torques import AT_RANDOM
 from crazyem.diagnosis.naming import answer, determined
 from crazyem.diagnosis.naming import select as selecting
-from crazyem.diagnosis.naming.named import trust
+from crazyem.diagnosis.naming.named import structure_factor
 from crazyem.diagnosis.naming.select import select
 from crazyem.diagnosis.naming.trials import Selection
 from crazyem.diagnosis.naming.unexplained import Unexplained, notable
@@ -61,7 +61,7 @@ def test_an_inertia_that_no_body_has_leaves_open_what_turns_the_drone(slow_to_tu
 def test_what_went_on_to_its_end_is_taken_back_and_the_selection_goes_on(monkeypatch):
     """As a slope of the thrust curve did, in the fit with all that is free: a thrust that does not heed its command."""
     data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02), thrust=(0.9,) * 4), seconds=10.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, first_guess()))
+    point = nominal(data, Point(DRONE, {}, start_noise()))
     real, said = selecting.refine_anew, []
     end = THRUST.range_of("scale")[0]
 
@@ -71,7 +71,7 @@ def test_what_went_on_to_its_end_is_taken_back_and_the_selection_goes_on(monkeyp
             return replace(fit, point=fit.point.with_effects({"thrust_scale": {"scale": end}}))
         return fit
 
-    monkeypatch.setattr(selecting, "refine_anew", too_far)
+    monkeypatch.setattr(selecting, "refine_with_memory", too_far)
     found = select(data, point, [THRUST, DRAG], say=said.append)
     assert sum("at the end of its physical range: thrust_scale" in text for text in said) == 1
     assert "thrust_scale" not in {c.effect for c in found.accepted}
@@ -95,7 +95,7 @@ def test_after_an_exchange_the_selection_goes_on(slow_to_turn, monkeypatch):
     monkeypatch.setattr(diagnosing, "select", counted)
     assert [e.name for e in diagnose([slow_to_turn], DRONE, wanted=["linear_drag"]).effects] == ["linear_drag"]
     assert calls == [None]
-    monkeypatch.setattr(diagnosing, "named_again", emptied)
+    monkeypatch.setattr(diagnosing, "with_better_rivals", emptied)
     assert [e.name for e in diagnose([slow_to_turn], DRONE, wanted=["linear_drag"]).effects] == ["linear_drag"]
     assert len(calls) == 3
     assert calls[2].accepted == ()
@@ -113,7 +113,7 @@ def test_with_a_trim_a_load_is_told_with_two_weak_rotors(vehicle, alike):
 
 
 def test_from_day_to_day_forces_differ_by_more():
-    point = Point(DRONE, {}, first_guess())
+    point = Point(DRONE, {}, start_noise())
     weight = 9.81 * DRONE.mass
     for share, vehicle, counts in ((0.015, DRONE, True), (0.015, TRIMMED, False), (0.025, TRIMMED, True)):
         force = Finding("force", "x", "always", "", (0.0, 9.0), share * weight, 1e-4, "N", 60.0, 1e-9)
@@ -126,9 +126,9 @@ def test_where_torques_say_nothing_they_say_nothing_against_what_forces_tell():
         return Finding(signal, "x", "always", "", (0.0, 9.0), 1.0, 0.1, "", nats, 1e-9)
 
     remains = Unexplained((left("torque", 300.0), left("body_rate", 90.0)), 900.0)
-    assert trust(remains) == CONFIDENCE.doubtful
-    assert trust(remains.of_forces()) == 1.0
-    assert trust(remains.with_finding(left("force", 100.0)).of_forces()) == CONFIDENCE.doubtful
+    assert structure_factor(remains) == CONFIDENCE.doubtful
+    assert structure_factor(remains.of_forces()) == 1.0
+    assert structure_factor(remains.with_finding(left("force", 100.0)).of_forces()) == CONFIDENCE.doubtful
 
 
 def test_a_rotor_that_pushes_at_random_says_nothing_against_forces_that_last():
@@ -136,12 +136,12 @@ def test_a_rotor_that_pushes_at_random_says_nothing_against_forces_that_last():
     rotor = Finding("torque", "x", "rotor 4 at random", AT_RANDOM, (0.0, 9.0), 1e-4, 1e-5, "N m", 60.0, 1e-9)
     shaken = Finding("torque", "x", "frequency 5.2 Hz", "frequency", (0.0, 9.0), 1e-4, 1e-5, "N m", 60.0, 1e-9)
     remains = Unexplained((rotor,), 900.0)
-    assert trust(remains) == CONFIDENCE.doubtful
-    assert trust(remains.without_random_rotor()) == 1.0
-    assert trust(remains.without_random_rotor(4)) == 1.0  # nor against its being weak
-    assert trust(remains.without_random_rotor(1)) == CONFIDENCE.doubtful
+    assert structure_factor(remains) == CONFIDENCE.doubtful
+    assert structure_factor(remains.without_random_rotor()) == 1.0
+    assert structure_factor(remains.without_random_rotor(4)) == 1.0  # nor against its being weak
+    assert structure_factor(remains.without_random_rotor(1)) == CONFIDENCE.doubtful
     swinging = remains.with_finding(shaken)  # a loop that swings looks like a drag
-    assert trust(swinging.without_random_rotor()) == CONFIDENCE.doubtful
+    assert structure_factor(swinging.without_random_rotor()) == CONFIDENCE.doubtful
     data = SimpleNamespace(coarse=False)
     for name, rotor, against in (
         ("linear_drag", 0, False), ("inertia_products", 0, True), ("rotor_fault", 4, False), ("rotor_fault", 1, True),

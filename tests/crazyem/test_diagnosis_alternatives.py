@@ -10,7 +10,7 @@ from unknown_effects import unknown
 
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.naming import alternatives
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.settings import SELECTION
@@ -19,7 +19,7 @@ from crazyem.diagnosis.workers import Workers
 LOAD = Candidate("payload", (), ("mass", "x", "y", "z"))
 WEAKER = Candidate("thrust_scale", (), ("scale",))
 FLAPPING = Candidate("velocity_moment", (), ("roll_per_vy", "pitch_per_vx"))
-BARE = Point(DRONE, {}, first_guess())
+BARE = Point(DRONE, {}, start_noise())
 POINT = BARE.with_effects({"payload": {**LOAD.neutral(BARE), "mass": 0.004},
                            "velocity_moment": {"roll_per_vy": 1e-5, "pitch_per_vx": 1e-5}})  # fmt: skip
 THERE = BARE.with_effects({"thrust_scale": {"scale": 0.9}})
@@ -46,8 +46,8 @@ def asked(monkeypatch: pytest.MonkeyPatch, *, load: float, weaker: float, was: f
         return weaker, BLOCKS + weaker / 20, unknown(candidates)
 
     monkeypatch.setattr(alternatives, "refitted", judged)
-    monkeypatch.setattr(alternatives, "refine_anew", lambda data, point, accepted: SimpleNamespace(point=point))
-    return alternatives.named_again(SimpleNamespace(flights=[], workers=Workers(1)), None, selection)  # type: ignore[arg-type]
+    monkeypatch.setattr(alternatives, "refine_with_memory", lambda data, point, accepted: SimpleNamespace(point=point))
+    return alternatives.with_better_rivals(SimpleNamespace(flights=[], workers=Workers(1)), None, selection)  # type: ignore[arg-type]
 
 
 def names(selection: Selection) -> list[str]:
@@ -95,7 +95,7 @@ def test_one_effect_alone_is_not_asked_again(monkeypatch):
     monkeypatch.setattr(alternatives, "refitted", lambda *a: pytest.fail("nothing is new"))
     taken = trial(LOAD, 100.0, POINT)
     alone = Selection(BARE, POINT, (Step((taken, trial(WEAKER, 99.0, THERE)), taken),), (LOAD,), SimpleNamespace(), 34)  # type: ignore[arg-type]
-    assert alternatives.named_again(SimpleNamespace(flights=[], workers=Workers(1)), None, alone) is alone  # type: ignore[arg-type]
+    assert alternatives.with_better_rivals(SimpleNamespace(flights=[], workers=Workers(1)), None, alone) is alone  # type: ignore[arg-type]
     assert replace(alone) == alone
 
 
@@ -111,7 +111,9 @@ def test_what_ended_where_its_range_ends_gives_way_to_whatever_is_next(monkeypat
         selection = Selection(BARE, point, steps, (slope, FLAPPING), SimpleNamespace(), 34)  # type: ignore[arg-type]
         monkeypatch.setattr(alternatives, "refitted", lambda data, held_out, start, candidates: (
             (1000.0 if candidates[0] is slope else 100.0), BLOCKS, unknown(candidates)))  # fmt: skip
-        monkeypatch.setattr(alternatives, "refine_anew", lambda data, point, accepted: SimpleNamespace(point=point))
-        found = alternatives.named_again(SimpleNamespace(flights=[], workers=Workers(1)), None, selection)  # type: ignore[arg-type]
+        monkeypatch.setattr(
+            alternatives, "refine_with_memory", lambda data, point, accepted: SimpleNamespace(point=point)
+        )
+        found = alternatives.with_better_rivals(SimpleNamespace(flights=[], workers=Workers(1)), None, selection)  # type: ignore[arg-type]
         assert names(found) == [name, "velocity_moment"]
         assert (slope in [t.candidate for t in found.steps[0].trials]) == (name == "thrust_curve")

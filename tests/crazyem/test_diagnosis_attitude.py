@@ -10,7 +10,7 @@ from made_flight import array_of
 
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.estimation import steps
@@ -111,7 +111,7 @@ def test_errors_that_last_are_found_and_are_no_noise_of_the_gyro() -> None:
     """Errors of 4 mrad about two of three axes that last 0.04 s: gyro and shaking stay as without such errors."""
     recording = fly(seconds=15.0, seed=5, rate_noise=2e-3, shake=0.3)
     right, wrong = (
-        refine_base(data, nominal(data, Point(DRONE, {}, first_guess())), ()).point.noise
+        refine_base(data, nominal(data, Point(DRONE, {}, start_noise())), ()).point.noise
         for data in (Data([flight_of(onboard(recording, wrong=w), DRONE)]) for w in (False, True))
     )
     assert wrong.measurement[3] == pytest.approx(right.measurement[3], rel=0.2)

@@ -15,7 +15,7 @@ from scipy import stats
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, nominal
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import balance as balancing
 from crazyem.diagnosis.naming.answer import _by_the_day, _steady_rivals
@@ -25,11 +25,11 @@ from crazyem.diagnosis.naming.balance import (
     balance_loglik,
     balance_of,
     by_balance,
-    hidden_by_the_day,
-    how_weak,
-    prefers,
+    hidden_by_daily_variation,
+    log_odds_by_balance,
+    rotor_loss,
+    rotor_signatures,
     steady,
-    without_each,
 )
 from crazyem.diagnosis.naming.trials import Trial
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -68,21 +68,21 @@ def loaded(share: float, x: float, y: float) -> NDArray:
 @pytest.mark.parametrize("number", [1, 2, 3, 4])
 def test_a_weak_rotor_is_told_from_every_other_and_from_a_load_by_its_drag(number: int) -> None:
     shown = balance(0.3 * EACH[number - 1])
-    assert how_weak(shown, number)[0] == pytest.approx(0.3)
+    assert rotor_loss(shown, number)[0] == pytest.approx(0.3)
     assert balance_loglik(shown, "rotor_fault", {"rotor": number}) == pytest.approx(-1.0)
     for other in (*(rotor(k) for k in (1, 2, 3, 4) if k != number), WIND, STRONG):
-        told = prefers(shown, rotor(number), other)
+        told = log_odds_by_balance(shown, rotor(number), other)
         assert told is not None
         assert told > 3.0
     # 0.3 of a rotor is 0.45 mm of drag torque, 2.8 days
-    told = prefers(shown, rotor(number), LOAD)
+    told = log_odds_by_balance(shown, rotor(number), LOAD)
     assert told == pytest.approx(0.5 * (DAYS + 4) * np.log1p((0.3 * 0.25 * TURN / SD[3]) ** 2 / DAYS) + 2.0)
 
 
 def test_a_load_by_two_rotors_is_none_of_them() -> None:
     shown = balance(loaded(0.08, 0.0, 0.03))  # on the left, between rotors 3 and 4
     for number in (1, 2, 3, 4):
-        told = prefers(shown, LOAD, rotor(number))
+        told = log_odds_by_balance(shown, LOAD, rotor(number))
         assert told is not None
         assert told > 3.0
     assert balance_loglik(shown, "payload", {}) == pytest.approx(-3.0, abs=1e-3)
@@ -137,7 +137,7 @@ def test_days_are_drawn_with_the_uncertainty_that_is_told() -> None:
     held = 0
     for _ in range(400):
         day = SD * rng.standard_normal(4) * np.sqrt(DAYS / rng.chisquare(DAYS))
-        lack, sd = how_weak(balance(0.2 * EACH[2] + day), 3)
+        lack, sd = rotor_loss(balance(0.2 * EACH[2] + day), 3)
         held += abs(lack - 0.2) < sd * stats.t.ppf(0.975, DAYS)
     assert held / 400 == pytest.approx(0.95, abs=0.03)
 
@@ -145,15 +145,15 @@ def test_days_are_drawn_with_the_uncertainty_that_is_told() -> None:
 def test_what_moves_no_balance_or_sets_in_later_is_not_weighed() -> None:
     shown = balance(0.2 * EACH[0])
     assert balance_loglik(shown, "linear_drag", {}) is None
-    assert prefers(shown, rotor(1), DRAG) is None
-    assert prefers(shown, rotor(1, onset=4.0), LOAD) is None
+    assert log_odds_by_balance(shown, rotor(1), DRAG) is None
+    assert log_odds_by_balance(shown, rotor(1, onset=4.0), LOAD) is None
     assert not steady(rotor(1, onset=4.0))
 
 
 def data_of(hidden: Hidden, seed: int) -> tuple[Data, Point]:
     data = Data([flight_of(fly(hidden, seconds=9.0, seed=seed), TRIMMED)])
     effects = {n: dict(v) for n, v in TRIMMED.effects.items()}
-    return data, nominal(data, Point(TRIMMED, effects, first_guess()))
+    return data, nominal(data, Point(TRIMMED, effects, start_noise()))
 
 
 def test_the_balance_of_a_flight_is_what_was_hidden_in_it() -> None:
@@ -166,7 +166,7 @@ def test_the_balance_of_a_flight_is_what_was_hidden_in_it() -> None:
     sd = np.sqrt(np.diag(found.covariance))
     assert np.all(sd >= SD)
     assert np.all(sd < 1.5 * SD)
-    assert found.rotors == pytest.approx(without_each(data, point))
+    assert found.rotors == pytest.approx(rotor_signatures(data, point))
     # each rotor's torque by its thrust; the twist is held against by those that turn one way
     assert found.rotors / found.rotors[:, :1] == pytest.approx(EACH / EACH[:, :1])
     assert found.rotors[:, 0] == pytest.approx(0.25 + 0.25 * 1.1e-3 / TURN * np.array([1, -1, 1, -1]), abs=5e-3)
@@ -185,7 +185,7 @@ def test_a_name_stands_unless_another_is_better_or_a_simpler_one_no_worse(monkey
         return Trial(candidate, 100.0, 100.0, 1.0, 1e-9, 100.0, fitted=fitted)
 
     unfitted = replace(trial(STRONG), fitted=None)
-    point = Point(TRIMMED, {}, first_guess())
+    point = Point(TRIMMED, {}, start_noise())
     data: Any = None
     left = loaded(0.08, 0.0, 0.03)
     for lack, name, rival, taken in (
@@ -205,12 +205,12 @@ def test_a_name_stands_unless_another_is_better_or_a_simpler_one_no_worse(monkey
         assert by_balance(data, selection)[1] is shown
         assert [t.candidate.effect for t in instead] == ([taken] if taken else [])
         lacks = {"rotor_fault": True, "payload": False, "": name is not LOAD}[taken]
-        assert sized == pytest.approx([1.0 - how_weak(shown, 3)[0]] if lacks else [])
+        assert sized == pytest.approx([1.0 - rotor_loss(shown, 3)[0]] if lacks else [])
     # two steady effects, one that sets in, a trim that was found, no trim in the file: nothing is weighed
     trimmed = (LOAD, Candidate(TRIM, (), ("x",)))
     asked = [((LOAD, STRONG), TRIMMED), ((rotor(2, onset=3.0),), TRIMMED), (trimmed, TRIMMED), ((LOAD,), DRONE)]
     for accepted, vehicle in asked:
-        other: Any = SimpleNamespace(accepted=accepted, steps=(step,), nominal=Point(vehicle, {}, first_guess()))
+        other: Any = SimpleNamespace(accepted=accepted, steps=(step,), nominal=Point(vehicle, {}, start_noise()))
         assert by_balance(data, other) == (other, None)
 
     def lost(data: Data, point: Point) -> Balance:
@@ -226,31 +226,34 @@ def test_where_nothing_steady_is_found_it_is_said_what_a_day_hides_of_a_weak_rot
     data: Any = None
 
     def selection(*accepted: Candidate, vehicle: Vehicle = TRIMMED) -> Any:
-        return SimpleNamespace(accepted=accepted, nominal=Point(vehicle, {}, first_guess()))
+        return SimpleNamespace(accepted=accepted, nominal=Point(vehicle, {}, start_noise()))
 
-    reach = 100 * stats.t.ppf(0.975, DAYS) * max(how_weak(shown, k)[1] for k in (1, 2, 3, 4))
-    each = ", ".join(f"{100 * how_weak(shown, k)[0]:.0f}" for k in (1, 2, 3, 4)).replace("-0", "0")
-    (text,) = hidden_by_the_day(data, selection(DRAG), asked).values()
+    reach = 100 * stats.t.ppf(0.975, DAYS) * max(rotor_loss(shown, k)[1] for k in (1, 2, 3, 4))
+    each = ", ".join(f"{100 * rotor_loss(shown, k)[0]:.0f}" for k in (1, 2, 3, 4)).replace("-0", "0")
+    (text,) = hidden_by_daily_variation(data, selection(DRAG), asked).values()
     assert f"lacks up to {reach:.0f} % of its thrust" in text
     assert f"rotors 1 to 4 lack {each} %, each +- {reach:.0f} (95 %)" in text
     assert each.split(", ")[2] == "7"
     # what was found or not asked for, and a drone without a trim of the day
-    assert not hidden_by_the_day(data, selection(rotor(3)), asked)
-    assert not hidden_by_the_day(data, selection(), [DRAG, STRONG])
-    assert not hidden_by_the_day(data, selection(vehicle=DRONE), asked)
+    assert not hidden_by_daily_variation(data, selection(rotor(3)), asked)
+    assert not hidden_by_daily_variation(data, selection(), [DRAG, STRONG])
+    assert not hidden_by_daily_variation(data, selection(vehicle=DRONE), asked)
 
     def lost(data: Data, point: Point) -> Balance:
         raise DivergedError("lost")
 
     monkeypatch.setattr(balancing, "balance_of", lost)
-    assert set(hidden_by_the_day(data, selection(), asked)) == {"rotor_fault", "payload"}  # neither was asked for
+    assert set(hidden_by_daily_variation(data, selection(), asked)) == {
+        "rotor_fault",
+        "payload",
+    }  # neither was asked for
 
 
 def test_a_rotor_is_told_with_the_day_as_its_uncertainty_and_rivals_by_the_balance() -> None:
     shown = balance(0.25 * EACH[2])
-    point = Point(TRIMMED, {"rotor_fault": {"rotor": 3, "scale": 0.75, "onset_time": None}}, first_guess())
+    point = Point(TRIMMED, {"rotor_fault": {"rotor": 3, "scale": 0.75, "onset_time": None}}, start_noise())
     numbers, p_value = _by_the_day(rotor(3), point, shown)  # type: ignore[misc]
-    sd = how_weak(shown, 3)[1]
+    sd = rotor_loss(shown, 3)[1]
     reach = sd * stats.t.ppf(0.975, DAYS)
     assert numbers["scale"].ci95 == pytest.approx((0.75 - reach, 0.75 + reach))
     assert p_value < 1e-3
@@ -260,5 +263,8 @@ def test_a_rotor_is_told_with_the_day_as_its_uncertainty_and_rivals_by_the_balan
     rivals = [Trial(c, 1.0, 1.0, 1.0, 1e-9, 1.0) for c in (LOAD, DRAG, WIND)]
     rest, nats = _steady_rivals(rotor(3), rivals, shown)
     assert [t.candidate.effect for t in rest] == ["linear_drag"]
-    assert nats == {"payload": prefers(shown, rotor(3), LOAD), "wind": prefers(shown, rotor(3), WIND)}
+    assert nats == {
+        "payload": log_odds_by_balance(shown, rotor(3), LOAD),
+        "wind": log_odds_by_balance(shown, rotor(3), WIND),
+    }
     assert _steady_rivals(rotor(3), rivals, None) == (rivals, {})

@@ -18,8 +18,8 @@ from crazyem.diagnosis.prediction.bias_correction import (
     Weights,
     correction_weights,
     moments,
-    regressed,
-    remembered,
+    regression,
+    weighted_mean,
 )
 from crazyem.diagnosis.prediction.predict import _at_start, predict, recorded
 from crazyem.diagnosis.settings import PREDICTION
@@ -83,7 +83,7 @@ def test_the_running_sums_are_those_of_a_plain_loop() -> None:
     y = 0.3 * x[:, 0] + 0.1 * x[:, 1] + 0.2 * draw.standard_normal(400)
     sd = np.array([1.0, 0.3, 5.0])
     last = (250, 399)
-    found = regressed(x, y, sd, alike, STEP, np.array(last))
+    found = regression(x, y, sd, alike, STEP, np.array(last))
     for row, k in zip(found, last, strict=True):
         age, rows = np.exp(-(k - np.arange(k + 1)) * STEP / PREDICTION.memory), x[: k + 1]
         a, b = (rows * age[:, None]).T @ rows, (rows * age[:, None]).T @ y[: k + 1]
@@ -101,11 +101,11 @@ def test_earlier_flights_count_as_if_they_had_just_been_flown() -> None:
     i, j = np.triu_indices(2)
     mean = np.column_stack([x[:, i] * x[:, j], x * y[:, None], y * y, np.ones(rows)]).mean(axis=0)
     later_x, later_y = draw.standard_normal((50, 2)), draw.standard_normal(50)
-    found = regressed(later_x, later_y, sd, 1.0, STEP, np.array([-1, 49]), before=mean)
+    found = regression(later_x, later_y, sd, 1.0, STEP, np.array([-1, 49]), before=mean)
     # the earlier rows again and again, until the memory is full of them
     many = round(10 * PREDICTION.memory / STEP / rows) + 1
     flown_x, flown_y = (np.concatenate([*[old] * many, new]) for old, new in ((x, later_x), (y, later_y)))
-    wanted = regressed(flown_x, flown_y, sd, 1.0, STEP, np.array([many * rows - 1, many * rows + 49]))
+    wanted = regression(flown_x, flown_y, sd, 1.0, STEP, np.array([many * rows - 1, many * rows + 49]))
     assert found == pytest.approx(wanted, abs=5e-3)
 
 
@@ -164,7 +164,7 @@ def test_a_mean_of_what_counts_so_far_is_that_of_a_plain_loop() -> None:
     draw = np.random.default_rng(7)
     value, counts = draw.standard_normal((300, 3)), draw.random(300) < 0.6
     counts[:20], value[50] = False, np.nan
-    found = remembered(value, counts, STEP)
+    found = weighted_mean(value, counts, STEP)
     for row in (0, 19, 120, 299):
         use = np.flatnonzero(counts[: row + 1] & np.isfinite(value[: row + 1, 0]))
         weight = np.exp(-(row - use) * STEP / PREDICTION.memory)

@@ -13,23 +13,32 @@ from scipy.special import expit, logit
 
 from crazyem.diagnosis.diagnose import _corroborated
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, remembering
+from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, with_torque_memory
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.place import depends_on_place
 from crazyem.diagnosis.naming.answer import answer_of
 from crazyem.diagnosis.naming.corroboration import _lag_of, false_speed, late_measurements
 from crazyem.diagnosis.naming.presence import presence
-from crazyem.diagnosis.naming.trials import Selection, Step, Trial, between, both, distinguishable, margin, scatter
+from crazyem.diagnosis.naming.trials import (
+    Selection,
+    Step,
+    Trial,
+    between,
+    distinguishable,
+    margin,
+    p_value_of_both,
+    scatter,
+)
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.diagnosis.settings import CONFIDENCE, SELECTION
 from crazyem.recordings.recording import Recording
 
 
 def point_of(data: Data) -> Point:
-    return nominal(data, Point(DRONE, {}, first_guess()))
+    return nominal(data, Point(DRONE, {}, start_noise()))
 
 
 @pytest.fixture(scope="module")
@@ -193,10 +202,10 @@ def test_blocks_know_their_recording() -> None:
 def test_sampled_commands_are_torques_with_the_memory_of_the_lag() -> None:
     """A noisy gyro at 500 Hz makes commands of which the log at 100 Hz sees every fifth."""
     data = Data([flight_of(fly(rate_noise=0.15, shake=0.02, seconds=9.0), DRONE)])
-    white = Point(DRONE, {}, first_guess())
+    white = Point(DRONE, {}, start_noise())
     data.settle(white)
     white = data.fit_noise(white)
-    remembered = remembering(data, white)
+    remembered = with_torque_memory(data, white)
     assert remembered.noise.memory == DRONE.motor_time_constant
     assert np.all(remembered.noise.disturbance[3:] > 0.1)
     assert data.loglik(remembered) > data.loglik(white) + 3.0
@@ -264,9 +273,10 @@ def test_few_recordings_do_not_tell_how_they_differ() -> None:
 
 
 def test_flights_held_out_lower_a_p_value_that_is_small_already() -> None:
-    assert both(5e-3, 10.0) == pytest.approx(5e-3 * np.exp(-10.0))
-    assert both(5e-3, -10.0) == 5e-3  # they do not raise it: what does not hold there is left out by its gain
-    assert both(0.05, 100.0) == 0.05
+    assert p_value_of_both(5e-3, 10.0) == pytest.approx(5e-3 * np.exp(-10.0))
+    # They do not raise the p-value: an effect that does not hold there is left out by its gain.
+    assert p_value_of_both(5e-3, -10.0) == 5e-3
+    assert p_value_of_both(0.05, 100.0) == 0.05
     rng = np.random.default_rng(0)  # a likelihood ratio of two fixed Gaussians, drawn from the first
     ratio = rng.normal(size=20000) * 2.0 - 2.0
     assert np.mean(np.exp(ratio) > 20.0) < 1 / 20

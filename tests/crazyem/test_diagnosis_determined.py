@@ -15,17 +15,17 @@ from crazyem.diagnosis.document import document_of
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import determined as deciding
 from crazyem.diagnosis.naming.determined import determined, without_undetermined
-from crazyem.diagnosis.naming.named import Named, Value, around
+from crazyem.diagnosis.naming.named import Named, Value, interval_95
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings.recording import Recording
 
-POINT = Point(DRONE, {}, first_guess())
+POINT = Point(DRONE, {}, start_noise())
 OWN = dict(zip(("xx", "yy", "zz", "time_constant"), (*DRONE.inertia, DRONE.motor_time_constant), strict=True))
 
 
@@ -34,7 +34,7 @@ def named(effect: str, values: dict[str, Value], **chosen: object) -> Named:
 
 
 def value(number: float, sd: float, ends: tuple[float, float] | None = None) -> Value:
-    return Value(number, "", sd, ends or around(number, sd))
+    return Value(number, "", sd, ends or interval_95(number, sd))
 
 
 def neutral_of(effect: str, name: str) -> float:

@@ -10,7 +10,7 @@ from closed_loop import DRONE, fly
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, refine
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming.select import Basis, fitted_trial
 from crazyem.diagnosis.naming.trials import Trial
@@ -24,7 +24,7 @@ def wild() -> tuple[Data, Point]:
     """A model whose drag, against a wind that no air has, is beyond all numbers."""
     data = Data([flight_of(fly(seconds=5.0), DRONE)])
     effects = {"quadratic_drag": {"x": 1e200, "y": 1e200, "z": 1e200}}
-    return data, Point(DRONE, effects, first_guess())
+    return data, Point(DRONE, effects, start_noise())
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")

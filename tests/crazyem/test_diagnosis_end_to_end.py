@@ -17,7 +17,7 @@ from crazyem.diagnosis.document import document_of
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.prediction.horizon import UNITS
@@ -209,7 +209,7 @@ def regressed(recording: Recording) -> NDArray[np.float64]:
 def gain(recording: Recording, *, sway: float) -> tuple[float, float]:
     """The factor on the torques by the likelihood, and its standard deviation; `sway` begins the disturbances."""
     data = Data([flight_of(recording, DRONE)])
-    point = Point(DRONE, {}, first_guess())
+    point = Point(DRONE, {}, start_noise())
     disturbance = np.array([0.0] * 3 + [sway] * 3)
     point = replace(point, noise=replace(point.noise, disturbance=disturbance, memory=1.0))
     data.settle(point)

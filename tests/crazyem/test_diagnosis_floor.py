@@ -8,8 +8,8 @@ from closed_loop import DRONE, Hidden, fly
 from made_flight import made_flight
 
 from crazyem.diagnosis.flights.flight import Flight, flight_of
-from crazyem.diagnosis.flights.floor import on_one_floor
-from crazyem.diagnosis.flights.recording_nuisances import owned
+from crazyem.diagnosis.flights.floor import with_common_floor
+from crazyem.diagnosis.flights.recording_nuisances import nuisances_of_recordings
 
 FLOORS = (0.05, 0.056, 0.06)
 
@@ -38,12 +38,12 @@ def test_a_recording_says_whether_it_shows_the_floor() -> None:
 
 def test_a_flight_that_never_rests_stands_where_the_others_do() -> None:
     flights, unknown = [flight(k, g) for k, g in enumerate(FLOORS)], flight(3, 0.0, grounded=False)
-    fitted, apart = on_one_floor(flights, [unknown])
+    fitted, apart = with_common_floor(flights, [unknown])
     assert all(a is b for a, b in zip(fitted, flights, strict=True))
     assert apart[0].ground == pytest.approx(0.056)
     assert np.array_equal(apart[0].y, unknown.y)
-    assert any("z = 0.056 m" in n for n in owned(fitted, apart)[-1].notices)
-    (first, *_), _ = on_one_floor([unknown, *flights], [])
+    assert any("z = 0.056 m" in n for n in nuisances_of_recordings(fitted, apart)[-1].notices)
+    (first, *_), _ = with_common_floor([unknown, *flights], [])
     assert first.ground == pytest.approx(0.056)
 
 
@@ -52,12 +52,12 @@ def test_a_flight_that_never_rests_stands_where_the_others_do() -> None:
 )
 def test_where_the_others_do_not_tell_it_stays(others: tuple[float, ...]) -> None:
     unknown = flight(3, 0.0, grounded=False)
-    _, apart = on_one_floor([flight(k, g) for k, g in enumerate(others)], [unknown])
+    _, apart = with_common_floor([flight(k, g) for k, g in enumerate(others)], [unknown])
     assert apart[0] is unknown
 
 
 def test_without_positions_there_is_no_floor() -> None:
     blind = flight(3, 0.0, grounded=False)
     blind = replace(blind, y=np.where(np.arange(13) < 6, np.nan, blind.y))
-    _, apart = on_one_floor([flight(k, g) for k, g in enumerate(FLOORS)], [blind])
+    _, apart = with_common_floor([flight(k, g) for k, g in enumerate(FLOORS)], [blind])
     assert apart[0] is blind

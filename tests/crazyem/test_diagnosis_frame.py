@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.document import document_of
 from crazyem.diagnosis.flights.flight import Flight, flight_of
-from crazyem.diagnosis.flights.frame import alike, tilt_of
+from crazyem.diagnosis.flights.frame import in_mean_frame, tilt_of
 from crazyem.recordings.recording import Recording
 
 DRAG = Hidden(drag=(0.02, 0.015, 0.0))
@@ -42,14 +42,14 @@ def test_a_tilt_is_found_with_an_error_as_told() -> None:
 
 def test_frames_that_lie_alike_are_left_alone() -> None:
     flights = [flight(seed, 0.02, -0.01) for seed in range(4)]
-    fitted, apart = alike(flights[:3], flights[3:])
+    fitted, apart = in_mean_frame(flights[:3], flights[3:])
     assert all(a is b for a, b in zip([*fitted, *apart], flights, strict=True))
 
 
 def test_frames_are_turned_to_the_mean_of_those_fitted() -> None:
     truth = [(0.01, -0.01), (0.03, 0.01), (-0.01, 0.0), (0.06, 0.05)]
     flights = [flight(seed, *t) for seed, t in enumerate(truth)]
-    fitted, apart = alike(flights[:3], flights[3:])
+    fitted, apart = in_mean_frame(flights[:3], flights[3:])
     after = [found[0] for f in [*fitted, *apart] if (found := tilt_of(f)) is not None]
     assert np.ptp(after, axis=0) == pytest.approx(0.0, abs=2e-3)
     assert np.mean(after, axis=0) == pytest.approx([0.01, 0.0], abs=3e-3)  # of the first three: stays, to be named
@@ -61,7 +61,7 @@ def test_frames_are_turned_to_the_mean_of_those_fitted() -> None:
 
 def test_one_flight_or_a_filter_on_board_tells_nothing() -> None:
     alone = flight(0, 0.05, 0.0)
-    assert alike([alone], []) == ([alone], [])
+    assert in_mean_frame([alone], []) == ([alone], [])
     onboard = replace(alone, fused=True)
     assert tilt_of(onboard) is None
     still = replace(flight(1), signals=frozenset({"attitude", "velocity"}))
@@ -73,7 +73,7 @@ def test_a_drone_that_never_moves_is_upright() -> None:
     for f in still:
         f.y[:, :3], f.y[:, 6:10] = (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0)
     assert tilt_of(still[0]) == (pytest.approx([0.0, 0.0], abs=1e-9), pytest.approx([1e-5, 1e-5]))
-    assert alike(still, []) == (still, [])
+    assert in_mean_frame(still, []) == (still, [])
 
 
 @pytest.mark.slow

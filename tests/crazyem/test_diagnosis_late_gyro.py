@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -32,7 +32,7 @@ def test_a_late_gyro_is_late_by_what_it_was_shifted(late: float) -> None:
     rate = recording.signals["body_rate"]
     shown = array_of("body_rate", rate.time, CubicSpline(rate.time, rate.value)(rate.time - late), place=95)
     data = Data([flight_of(replace(recording, signals={**recording.signals, "body_rate": shown}), DRONE)])
-    begun = nominal(data, Point(DRONE, {}, first_guess())).with_effects(
+    begun = nominal(data, Point(DRONE, {}, start_noise())).with_effects(
         {"measurement_delay": {"delay": 0.002, "streams": ("gyro",)}}
     )
     found = refine_base(data, begun, [GYRO]).point.effects
@@ -58,14 +58,14 @@ def test_rates_of_motion_alone_are_turned_by_what_acts() -> None:
     """The rate but for a constant: the sum of angular accelerations over the steps, none across a gap."""
     recording = fly(seconds=8.0)
     data = Data([flight_of(recording, DRONE)])
-    point = nominal(data, Point(DRONE, {}, first_guess()))
+    point = nominal(data, Point(DRONE, {}, start_noise()))
     model = data.models[0]
     model.settle(point)
     with_delay = point.with_effects({"measurement_delay": {"delay": 0.01, "streams": ("gyro",)}})
     acceleration, situation = model.accelerations(with_delay)
     offset = model.offsets(with_delay, acceleration)
-    assert model.moved is not None
+    assert model.observed_acceleration is not None
     rows = np.flatnonzero(~model.flight.starts & (np.diff(model.flight.time, prepend=-1.0) > 0))[5:]
     assert np.allclose(situation.step[rows], 0.01, atol=1e-4)
     # a delay of one step of 10 ms takes back what acted over that step
-    assert np.allclose(offset[rows, 9:12], -0.01 * model.moved[rows, 3:], atol=2e-4)
+    assert np.allclose(offset[rows, 9:12], -0.01 * model.observed_acceleration[rows, 3:], atol=2e-4)

@@ -12,8 +12,8 @@ from made_flight import Motion, changed, made_flight, without
 
 from crazyem.diagnosis.fitting.candidates import candidates_for
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.fitting.nuisances import abstained
+from crazyem.diagnosis.fitting.noise import start_noise
+from crazyem.diagnosis.fitting.nuisances import without_unobservable
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.flights.inputs import inputs_of
 from crazyem.diagnosis.prediction.predict import predict, recorded
@@ -136,14 +136,14 @@ def test_how_heavy_or_strong_the_drone_is_is_left_open():
     flight = flight_of(unmeasured(), DRONE)
     assert flight.levelled
     assert not flight_of(made_flight(MOTION, noise=0.0), DRONE).levelled
-    point = Point(DRONE, {}, first_guess())
+    point = Point(DRONE, {}, start_noise())
     found, left_out = candidates_for(point, flight.signals, measured_speeds=False)
     data = SimpleNamespace(flights=[flight], coarse=False)
-    kept, reasons = abstained(data, point, found, left_out)
+    kept, reasons = without_unobservable(data, point, found, left_out)
     gone = {"payload", "thrust_scale"}
     assert {c.effect for c in found} - {c.effect for c in kept} == gone
     assert all("no battery voltage" in reasons[n] for n in gone)
     assert "gain_per_second" in {n for c in kept if c.effect == "battery_sag" for n in c.free}
     data.flights += [replace(flight, levelled=False)]
-    kept, _ = abstained(data, point, found, left_out)
+    kept, _ = without_unobservable(data, point, found, left_out)
     assert gone <= {c.effect for c in kept}  # one that was measured can tell

@@ -12,7 +12,7 @@ from unknown_effects import unknown
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import load_or_rotors
@@ -36,8 +36,8 @@ def test_what_stands_in_the_place_of_a_load_pays_for_its_parameters_and_for_bein
 ) -> None:
     """Weaker rotors `alone` [nats] or, where they do not explain the torque of a load, with a shifted centre (104)."""
     vehicle = DRONE if not trim else SimpleNamespace(**{**vars(DRONE), "effects": {TRIM: {"x": 0.0}}})
-    effects = {"payload": LOAD.neutral(Point(DRONE, {}, first_guess())), "linear_drag": dict.fromkeys("xyz", 0.01)}
-    point = Point(vehicle, effects, first_guess())  # type: ignore[arg-type]
+    effects = {"payload": LOAD.neutral(Point(DRONE, {}, start_noise())), "linear_drag": dict.fromkeys("xyz", 0.01)}
+    point = Point(vehicle, effects, start_noise())  # type: ignore[arg-type]
     asked = []
 
     def judged(data: Any, held_out: Any, start: Point, candidates: Any) -> tuple[float, Any, Any]:
@@ -47,11 +47,11 @@ def test_what_stands_in_the_place_of_a_load_pays_for_its_parameters_and_for_bein
         return value, np.zeros(5), unknown(candidates)
 
     monkeypatch.setattr(load_or_rotors, "refitted", judged)
-    found = load_or_rotors.as_two(SimpleNamespace(), None, selection_of(point, (LOAD, DRAG)))  # type: ignore[arg-type]
+    found = load_or_rotors.load_against_rotors(SimpleNamespace(), None, selection_of(point, (LOAD, DRAG)))  # type: ignore[arg-type]
     assert found is not None
     both = ["thrust_scale"] if trim else ["thrust_scale", "center_of_mass"]
     assert asked[0][0] == ["payload", "linear_drag"]
-    assert [c.effect for c in load_or_rotors.instead_of_a_load(point.vehicle)] == both
+    assert [c.effect for c in load_or_rotors.load_substitutes(point.vehicle)] == both
     assert asked[1] == (["linear_drag", "thrust_scale"], ["linear_drag", "thrust_scale"])
     if not trim:
         assert asked[2] == (["linear_drag", *both], sorted(["linear_drag", *both]))
@@ -61,15 +61,15 @@ def test_what_stands_in_the_place_of_a_load_pays_for_its_parameters_and_for_bein
 
 
 def test_without_a_load_nothing_is_asked() -> None:
-    point = Point(DRONE, {"linear_drag": dict.fromkeys("xyz", 0.01)}, first_guess())
-    assert load_or_rotors.as_two(SimpleNamespace(), None, selection_of(point, (DRAG,))) is None  # type: ignore[arg-type]
+    point = Point(DRONE, {"linear_drag": dict.fromkeys("xyz", 0.01)}, start_noise())
+    assert load_or_rotors.load_against_rotors(SimpleNamespace(), None, selection_of(point, (DRAG,))) is None  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("scale", "tried", "asked_for"), [(0.8, False, True), (1.1, False, False), (0.8, True, False)])
 def test_a_load_in_the_place_of_weaker_rotors_weighs_what_they_lack(
     monkeypatch: pytest.MonkeyPatch, scale: float, tried: bool, asked_for: bool
 ) -> None:
-    point = Point(DRONE, {"thrust_scale": {"scale": scale}, "linear_drag": dict.fromkeys("xyz", 0.01)}, first_guess())
+    point = Point(DRONE, {"thrust_scale": {"scale": scale}, "linear_drag": dict.fromkeys("xyz", 0.01)}, start_noise())
     asked = []
 
     def judged(data: Any, held_out: Any, start: Point, candidates: Any) -> tuple[float, Any, Any]:
@@ -80,7 +80,7 @@ def test_a_load_in_the_place_of_weaker_rotors_weighs_what_they_lack(
     chosen = selection_of(point, (load_or_rotors.WEAKER, DRAG))
     beside = Trial(LOAD, 1.0, 1.0, 1.0, 0.1, 1.0, fitted=SimpleNamespace() if tried else None)  # type: ignore[arg-type]
     chosen = replace(chosen, steps=(replace(chosen.steps[0], trials=(beside,)), *chosen.steps[1:]))
-    found = load_or_rotors.as_load(SimpleNamespace(), None, chosen)  # type: ignore[arg-type]
+    found = load_or_rotors.rotors_against_load(SimpleNamespace(), None, chosen)  # type: ignore[arg-type]
     assert (found is not None) == asked_for == bool(asked)
     if found is not None:
         assert [names for names, _ in asked] == [["thrust_scale", "linear_drag"], ["linear_drag", "payload"]]
@@ -91,7 +91,7 @@ def test_a_load_in_the_place_of_weaker_rotors_weighs_what_they_lack(
 
 def test_weighing_is_asked_for_whether_a_load_is_told_apart_or_not() -> None:
     data = Data([flight_of(fly(Hidden(thrust=(0.9, 0.9, 0.9, 0.9)), seconds=8.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, first_guess()))
+    point = nominal(data, Point(DRONE, {}, start_noise()))
     begun = point.with_effects({"payload": {**LOAD.neutral(point), "mass": 0.0039}})
     fitted = refine_base(data, begun, [LOAD], rounds=1, noise=False)
     trial = Trial(LOAD, 50.0, 0.0, 1.0, 1e-9, 46.0, fitted, np.zeros(8), 50.0)
@@ -108,9 +108,9 @@ def test_weighing_is_asked_for_whether_a_load_is_told_apart_or_not() -> None:
 def test_rotors_that_are_all_weaker_are_not_told_from_a_load() -> None:
     """A tenth less thrust: a load of 3.9 g in the middle explains it but for the torque, which the two get right."""
     data = Data([flight_of(fly(Hidden(thrust=(0.9, 0.9, 0.9, 0.9)), seconds=12.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, first_guess()))
+    point = nominal(data, Point(DRONE, {}, start_noise()))
     begun = point.with_effects({"payload": {**LOAD.neutral(point), "mass": 0.0039}})
     fitted = refine_base(data, begun, [LOAD])
-    found = load_or_rotors.as_two(data, None, selection_of(fitted.point, (LOAD,), fitted))
+    found = load_or_rotors.load_against_rotors(data, None, selection_of(fitted.point, (LOAD,), fitted))
     assert found is not None
     assert not distinguishable(*found)

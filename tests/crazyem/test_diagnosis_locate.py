@@ -5,7 +5,7 @@ from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.locate import Located, locate
 
@@ -13,7 +13,7 @@ from crazyem.diagnosis.locating.locate import Located, locate
 def located(hidden: Hidden, seed: int) -> Located:
     """Of the nominal model; the drone's yaw swings by 0.8 rad."""
     data = Data([flight_of(fly(hidden, seed=seed, seconds=6.0), DRONE)])
-    return locate(data, nominal(data, Point(DRONE, {}, first_guess())))
+    return locate(data, nominal(data, Point(DRONE, {}, start_noise())))
 
 
 def along_the_world(found: Located) -> dict[str, float]:

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.naming import select
-from crazyem.diagnosis.naming.evidence import known_of, tuning
-from crazyem.diagnosis.naming.select import group_of, may_join, name_of
+from crazyem.diagnosis.naming.evidence import occam_cost, posterior_covariance
+from crazyem.diagnosis.naming.select import compatible, group_of, name_of
 from crazyem.diagnosis.naming.trials import Step, Trial, better, distinguishable, preferred
 from crazyem.diagnosis.settings import SELECTION
 from crazyem.diagnosis.workers import Workers
@@ -104,13 +104,13 @@ def test_without_evidence_enough_the_first_gives_the_name():
 
 
 def test_what_is_already_there_in_another_form_is_not_asked():
-    assert may_join("motor_lag", {"thrust_scale"})
-    assert may_join("payload", {"thrust_scale"})
-    assert not may_join("payload", {"thrust_scale", "motor_lag"})  # both heavier and stronger: more torque
-    assert not may_join("motor_lag", {"thrust_scale", "payload", "wind"})
-    assert not may_join("inertia", {"torque_scale"})
-    assert not may_join("wind", {"wind"})
-    assert may_join("wind", {"thrust_scale", "motor_lag"})
+    assert compatible("motor_lag", {"thrust_scale"})
+    assert compatible("payload", {"thrust_scale"})
+    assert not compatible("payload", {"thrust_scale", "motor_lag"})  # both heavier and stronger: more torque
+    assert not compatible("motor_lag", {"thrust_scale", "payload", "wind"})
+    assert not compatible("inertia", {"torque_scale"})
+    assert not compatible("wind", {"wind"})
+    assert compatible("wind", {"thrust_scale", "motor_lag"})
 
 
 def test_the_better_explanation_of_all_flights_leads_whichever_ruins_those_held_out_least(monkeypatch):
@@ -118,18 +118,18 @@ def test_the_better_explanation_of_all_flights_leads_whichever_ruins_those_held_
     fitted to both explains it by thousands of nats more."""
     linear, quadratic = trial("linear_drag", "xyz", 2000.0), trial("quadratic_drag", "xyz", 9000.0)
     linear, quadratic = replace(linear, evidence=26000.0), replace(quadratic, evidence=12000.0)
-    point = Point(DRONE, {}, first_guess())
+    point = Point(DRONE, {}, start_noise())
     basis = SimpleNamespace(held_out=object(), point=point, data=SimpleNamespace(workers=Workers(1)))
     own, given = object(), []
     monkeypatch.setattr(select, "with_held_out_by", lambda basis, trial: own)
     monkeypatch.setattr(select, "with_noise_refit", lambda basis, trial: given.append(basis) or trial)
     monkeypatch.setattr(select, "by_evidence", lambda trials, counted: sorted(trials, key=lambda t: -t.evidence))
-    trials, equals = select.compared_again(basis, [linear, quadratic], say=lambda text: None)
+    trials, equals = select.compared_with_refitted_noise(basis, [linear, quadratic], say=lambda text: None)
     assert trials[0] is linear
     assert equals == [quadratic]
     assert given == [own, own]  # all that are compared begin with the same noise of the flights held out
     unsure = replace(quadratic, p_value=0.5)  # what may not be taken does not lead, however well it would fit
-    assert select.compared_again(basis, [linear, unsure], say=lambda text: None)[1][0] is linear
+    assert select.compared_with_refitted_noise(basis, [linear, unsure], say=lambda text: None)[1][0] is linear
 
 
 @given(st.lists(st.floats(1e-3, 1.0), min_size=4, max_size=4), st.integers(0, 1000))
@@ -142,7 +142,7 @@ def test_what_tuning_costs_is_the_evidence_of_a_linear_model(known: list[float],
     information = turn @ np.diag(np.array(known) ** -2.0) @ turn.T / np.outer(usual, usual)
     # integral of exp(-x'Ax/2) N(x; 0, U) = det(I + UA)^(-1/2), the maximum being at neutral
     wanted = 0.5 * np.linalg.slogdet(np.eye(4) + information * np.square(usual)[:, None])[1]
-    assert tuning([load], known_of([load], information)) == pytest.approx(max(4.0, wanted), rel=1e-5)
+    assert occam_cost([load], posterior_covariance([load], information)) == pytest.approx(max(4.0, wanted), rel=1e-5)
 
 
 @pytest.mark.parametrize("nats", [-2.0, 0.5, 2.0])
@@ -163,7 +163,7 @@ def test_inertias_that_are_one_factor_are_no_coincidence() -> None:
     usual = width**2 * (0.1 * np.eye(3) + 0.9)
     information = np.eye(3) / (width / 5) ** 2
     wanted = 0.5 * np.linalg.slogdet(np.eye(3) + usual @ information)[1]
-    assert tuning([inertia], known_of([inertia], information)) == pytest.approx(wanted, rel=1e-9)
+    assert occam_cost([inertia], posterior_covariance([inertia], information)) == pytest.approx(wanted, rel=1e-9)
     assert wanted == pytest.approx(3.4, abs=0.1)
     assert 1.5 * np.log(1.0 + 25.0) == pytest.approx(4.9, abs=0.1)  # were they independent of each other
 
@@ -172,8 +172,10 @@ def test_what_no_flight_tells_costs_a_nat_and_no_more() -> None:
     load = Candidate("payload", (), ("mass", "x", "y", "z"))
     told = np.zeros((6, 6))
     told[0, 0], told[4:, 4:] = 1e12, np.eye(2)
-    assert tuning([load], known_of([load], told)) == pytest.approx(0.5 * np.log1p(1e12 * 2.5e-3**2), rel=1e-6)
-    assert tuning([load], known_of([load], np.zeros((4, 4)))) == 4.0
+    assert occam_cost([load], posterior_covariance([load], told)) == pytest.approx(
+        0.5 * np.log1p(1e12 * 2.5e-3**2), rel=1e-6
+    )
+    assert occam_cost([load], posterior_covariance([load], np.zeros((4, 4)))) == 4.0
 
 
 def test_a_load_that_must_sit_in_the_middle_is_told_from_weak_rotors() -> None:
@@ -183,6 +185,6 @@ def test_a_load_that_must_sit_in_the_middle_is_told_from_weak_rotors() -> None:
     assert not distinguishable(weak, replace(load, tuned=None, value=103.5))
     scaled = np.diag(np.square([1e-5, 1e-4, 1e-4, 1.0]))
     at = Candidate("payload", (), ("mass", "x", "y", "z"))
-    cost = tuning([at], known_of([at], np.linalg.inv(scaled)))
+    cost = occam_cost([at], posterior_covariance([at], np.linalg.inv(scaled)))
     assert cost == pytest.approx(np.log(2.5e-3 / 1e-5) + 2 * np.log(1e-2 / 1e-4), abs=0.01)
     assert distinguishable(weak, replace(load, tuned=cost))

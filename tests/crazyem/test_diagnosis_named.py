@@ -17,14 +17,14 @@ from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted, bounds_of, nominal
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.fitting.nuisances import by_a_wrong_lag, nuisances, refine_base, systematic_sd
+from crazyem.diagnosis.fitting.noise import start_noise
+from crazyem.diagnosis.fitting.nuisances import error_by_lag, nuisances, refine_base, systematic_sd
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.naming import answer, determined, trials
 from crazyem.diagnosis.naming.answer import _numbers, _rivals, _uncertainty, strongest_first
 from crazyem.diagnosis.naming.determined import improbable
-from crazyem.diagnosis.naming.named import Named, one_factor, trust
+from crazyem.diagnosis.naming.named import Named, one_factor, structure_factor
 from crazyem.diagnosis.naming.presence import held_out_evidence, presence
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained
@@ -51,7 +51,7 @@ def test_chance_tells_one_factor_as_several_in_one_of_twenty():
 def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_asked(monkeypatch):
     flown = fly(Hidden(torque=0.7), seconds=12.0, seed=6)
     brought = []
-    monkeypatch.setattr(answer, "trust", lambda remains, nats: brought.append(nats) or 1.0)
+    monkeypatch.setattr(answer, "structure_factor", lambda remains, nats: brought.append(nats) or 1.0)
     monkeypatch.setattr(trials, "presence", lambda *args, **kwargs: 0.123)
     monkeypatch.setattr(determined, "improbable", lambda chance: "")
     monkeypatch.setattr(answer, "preferred", lambda taken, rivals: 1.0)
@@ -136,9 +136,14 @@ def left(nats: float, gained: float = 1e6) -> Unexplained:
 def test_what_is_left_says_less_the_less_of_it_there_is_and_the_more_a_name_brings(held, more, nats, other) -> None:
     least, most = sorted((held, more))
     few, many = sorted((nats, other))
-    assert trust(left(many), least) <= trust(left(few), least) <= trust(left(few), most) <= 1.0
-    assert trust(left(few, 0.0), most) == 0.0  # but nothing is worth more than its share of the structure
-    assert trust(Unexplained((), 1.0), least) == 1.0
+    assert (
+        structure_factor(left(many), least)
+        <= structure_factor(left(few), least)
+        <= structure_factor(left(few), most)
+        <= 1.0
+    )
+    assert structure_factor(left(few, 0.0), most) == 0.0  # but nothing is worth more than its share of the structure
+    assert structure_factor(Unexplained((), 1.0), least) == 1.0
 
 
 def test_a_name_is_sure_beside_what_it_outweighs() -> None:
@@ -149,11 +154,11 @@ def test_a_name_is_sure_beside_what_it_outweighs() -> None:
         (3.0, 0.5, 0.5),
         (20.0, 0.95, 1.0),
     ):
-        assert least - 1e-3 <= trust(left(26.0), times * 26.0) <= most
+        assert least - 1e-3 <= structure_factor(left(26.0), times * 26.0) <= most
 
 
 def point_of(**effects: dict[str, Any]) -> Point:
-    return Point(DRONE, effects, first_guess())
+    return Point(DRONE, effects, start_noise())
 
 
 def test_a_number_at_the_end_of_what_is_admitted_may_be_anywhere() -> None:
@@ -193,7 +198,7 @@ def test_what_no_scatter_shows_is_part_of_an_interval() -> None:
     assert never["suspended_load", "length"] == pytest.approx(0.002)
     assert never["suspended_load", "mass"] == pytest.approx(3e-3 * DRONE.mass)
     assert never["thrust_curve", "slope_error"] == pytest.approx(0.02)
-    data.models[0]._strays["suspended_load"] = True
+    data.models[0]._diverging["suspended_load"] = True
     shaken = systematic_sd(data, point_of(suspended_load={"mass": 0.002, "length": 0.4}))
     assert shaken["suspended_load", "length"] == pytest.approx(0.008)
     assert shaken["suspended_load", "mass"] == never["suspended_load", "mass"]
@@ -206,7 +211,7 @@ def test_inertias_are_as_unsure_as_a_lag_that_is_a_little_wrong_makes_them() -> 
     inertia = Candidate("inertia", (), ("xx", "yy", "zz"))
     start = nominal(data, point_of()).with_effects({"inertia": dict(zip(inertia.free, DRONE.inertia, strict=True))})
     fitted = refine_base(data, start, [inertia], rounds=3, noise=False)
-    off = by_a_wrong_lag(data, fitted)
+    off = error_by_lag(data, fitted)
     free = [c for c, _ in nuisances(data, fitted.point, [inertia])]
     names = [*inertia.free, *((c.effect, n) for c in free for n in c.free)]
     lag, size = names.index(("motor_lag", "time_constant")), fitted.gram.size
@@ -221,7 +226,7 @@ def test_inertias_are_as_unsure_as_a_lag_that_is_a_little_wrong_makes_them() -> 
         assert off["inertia", name] > 0.003 * DRONE.inertia[k]
     assert len(off) == 3
     assert (
-        by_a_wrong_lag(data, refine_base(data, start, [Candidate("motor_lag", (), ("time_constant",))], rounds=1)) == {}
+        error_by_lag(data, refine_base(data, start, [Candidate("motor_lag", (), ("time_constant",))], rounds=1)) == {}
     )
 
 
@@ -250,7 +255,7 @@ def test_what_is_needed_beside_a_name_is_no_other_name_for_it(accepted: list[str
 
 
 def test_later_effects_are_told_by_how_many_were_found_before_them_but_a_trim() -> None:
-    names, point = ("wind", "trim", "payload", "motor_lag"), Point(DRONE, {}, first_guess())
+    names, point = ("wind", "trim", "payload", "motor_lag"), Point(DRONE, {}, start_noise())
     steps = tuple(Step((), Trial(Candidate(n, (), ()), 1.0, 1.0, 1.0, 0.0, 1.0)) for n in names)
     selection = Selection(point, point, (*steps, Step((), None)), (), SimpleNamespace(), 4)  # type: ignore[arg-type]
     assert selection.orders() == [1, 2, 2, 3]

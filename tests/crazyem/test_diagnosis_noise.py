@@ -8,7 +8,7 @@ from closed_loop import turned
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis.fitting.noise import coloured, fit_noise, logs_of, noise_of, sample_rows, without_slight
+from crazyem.diagnosis.fitting.noise import coloured, fit_noise, logs_of, noise_of, sample_rows, without_negligible
 from crazyem.diagnosis.fitting.sweeps import Noise, run_sweep, scored_sweep
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.settings import NOISE
@@ -103,7 +103,7 @@ def test_coloured_errors_come_back_with_their_memory() -> None:
     np.testing.assert_allclose(found.coloured[:3], there.coloured[:3], rtol=0.25)
     assert np.all(np.abs(np.log(found.recall / there.recall))[:3] < np.log(1.5))
     np.testing.assert_allclose(found.measurement, TRUE.measurement, rtol=0.25)
-    white = without_slight(fit_noise([drawn(1, TRUE)], coloured(TRUE, [part[0]])), [part[0]])
+    white = without_negligible(fit_noise([drawn(1, TRUE)], coloured(TRUE, [part[0]])), [part[0]])
     assert not white.coloured.any()
 
 

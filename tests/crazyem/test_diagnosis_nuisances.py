@@ -11,23 +11,23 @@ from crazyem.diagnosis.fitting import nuisances as always
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
 from crazyem.diagnosis.fitting.fit import Data, DivergedError
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import (
     COARSE_REASON,
-    _let_go,
-    abstained,
+    _reset_conditional,
+    is_nonphysical,
     nuisances,
-    refine_anew,
     refine_base,
+    refine_with_memory,
     systematic_sd,
-    unlike_a_body,
+    without_unobservable,
 )
 from crazyem.diagnosis.flights.flight import _blocks, flight_of
-from crazyem.diagnosis.naming.detection_limits import matters
+from crazyem.diagnosis.naming.detection_limits import exceeds_limit
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.prior import AT_ONCE_SD
 
-POINT = Point(DRONE, {}, first_guess())
+POINT = Point(DRONE, {}, start_noise())
 
 
 class Made(SimpleNamespace):
@@ -91,8 +91,8 @@ def test_beside_heavy_rotors_a_damping_of_yaw_is_free_as_well_and_goes_with_them
     assert sd_of(flown(speed=0.1), heavy, "rate_damping") == pytest.approx(wanted)
     assert sd_of(flown(speed=0.1, measured=True), heavy, "rate_damping") == pytest.approx(np.full(3, 6e-6))
     left = POINT.with_effects({"rate_damping": {"x": 0.0, "y": 0.0, "z": 1e-4}})  # by a rotor inertia that is gone
-    assert "rate_damping" not in _let_go(left, (), []).effects
-    assert _let_go(left, [Candidate("rate_damping", (), ("x", "y", "z"))], []).effects == left.effects
+    assert "rate_damping" not in _reset_conditional(left, (), []).effects
+    assert _reset_conditional(left, [Candidate("rate_damping", (), ("x", "y", "z"))], []).effects == left.effects
 
 
 def test_intervals_hold_what_no_scatter_shows():
@@ -111,8 +111,8 @@ def test_no_drone_is_as_heavy_to_turn_as_if_its_mass_were_far_out():
     inertia = Candidate("inertia", (), ("xx", "yy", "zz"))
     for share, unlike in ((0.9, False), (1.1, True)):
         found = dict(zip(("xx", "yy", "zz"), (2e-5, 2e-5, share * mass * reach**2), strict=True))
-        assert unlike_a_body(POINT.with_effects({"inertia": found}), [inertia]) == unlike
-        assert not unlike_a_body(POINT.with_effects({"inertia": found}), [])  # free, and no finding
+        assert is_nonphysical(POINT.with_effects({"inertia": found}), [inertia]) == unlike
+        assert not is_nonphysical(POINT.with_effects({"inertia": found}), [])  # free, and no finding
 
 
 def test_torques_too_weak_for_a_body_are_inertias_too_large_for_one():
@@ -120,8 +120,8 @@ def test_torques_too_weak_for_a_body_are_inertias_too_large_for_one():
     weak = Candidate("torque_scale", (), ("scale",))
     for scale, unlike in ((1.1 * weakest, False), (0.9 * weakest, True)):
         point = POINT.with_effects({"torque_scale": {"scale": scale}})
-        assert unlike_a_body(point, [weak]) == unlike
-        assert not unlike_a_body(point, [])
+        assert is_nonphysical(point, [weak]) == unlike
+        assert not is_nonphysical(point, [])
 
 
 def test_no_drone_turns_as_in_honey():
@@ -129,8 +129,8 @@ def test_no_drone_turns_as_in_honey():
     damping = Candidate("rate_damping", (), ("x", "y", "z"))
     for most, unlike in ((5e-5, False), (5.6e-4, True)):
         point = POINT.with_effects({"rate_damping": {"x": 0.0, "y": most, "z": 0.0}})
-        assert unlike_a_body(point, [damping]) == unlike
-        assert not unlike_a_body(point, [])
+        assert is_nonphysical(point, [damping]) == unlike
+        assert not is_nonphysical(point, [])
 
 
 def data_of(flights):
@@ -142,19 +142,20 @@ def test_of_flights_whose_commands_do_not_turn_the_drone_nothing_fast_is_asked()
     sideways = ("payload", "center_of_mass", "rotor_fault")  # told from a thrust scale by their torque alone
     fast = [n for n, effect in CATALOGUE.items() if effect.needs_torques]
     candidates = [Candidate(n, (), ()) for n in (*fast, *sideways, "linear_drag", "wind", "thrust_scale")]
-    kept, reasons = abstained(data_of(flights), POINT, candidates, {})
+    kept, reasons = without_unobservable(data_of(flights), POINT, candidates, {})
     slow = ["thrust_curve", "motor_lag", "input_delay"]  # shown by forces
     assert [c.effect for c in kept] == [*slow, "linear_drag", "wind", "thrust_scale"]
     assert reasons == dict.fromkeys((*(n for n in fast if n not in slow), *sideways), COARSE_REASON)
     flights[1].coarse = False
-    assert abstained(data_of(flights), POINT, candidates, {})[0] == candidates
+    assert without_unobservable(data_of(flights), POINT, candidates, {})[0] == candidates
 
 
 def test_a_draft_of_a_room_is_a_finding_only_of_a_drone_whose_trim_does_not_change():
     of_one_drone = replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}})
     half = {"wind": {"x": 0.5, "y": 0.0, "z": 0.0}}
     found = [
-        matters(Point(v, half, first_guess()), Candidate("wind", (), ("x", "y", "z"))) for v in (DRONE, of_one_drone)
+        exceeds_limit(Point(v, half, start_noise()), Candidate("wind", (), ("x", "y", "z")))
+        for v in (DRONE, of_one_drone)
     ]
     assert found == [True, False]
 
@@ -178,12 +179,12 @@ def test_without_position_and_velocity_neither_wind_nor_what_swings_can_be_seen(
 def test_a_second_look_at_the_memory_of_torques_never_makes_a_fit_worse():
     """Begun with white torques where they sway for half a second, and once more where that is known."""
     data = Data([flight_of(fly(seconds=8.0, sway=3.0, seed=2), DRONE)])
-    begun = data.fit_noise(Point(DRONE, {}, first_guess()))
-    once, anew = (refine(data.twin(), begun, ()) for refine in (refine_base, refine_anew))
+    begun = data.fit_noise(Point(DRONE, {}, start_noise()))
+    once, anew = (refine(data.twin(), begun, ()) for refine in (refine_base, refine_with_memory))
     assert not once.point.noise.disturbance.any()
     assert anew.point.noise.disturbance[3:].any()
     assert anew.loglik > once.loglik + 10.0
-    again = refine_anew(data.twin(), anew.point, ())
+    again = refine_with_memory(data.twin(), anew.point, ())
     assert again.loglik > anew.loglik - 0.1
 
 
@@ -192,7 +193,7 @@ def test_what_is_free_no_longer_does_not_stay_where_it_was_left():
     held where it stood before, it would make all that is balanced by torques wrong by as much, and nobody be told."""
     data = Data([flight_of(fly(seconds=8.0, seed=3), DRONE)])
     lag = Candidate("motor_lag", (), ("time_constant",))
-    neutral = Point(DRONE, {}, first_guess()).with_effects({"motor_lag": lag.neutral(POINT)})
+    neutral = Point(DRONE, {}, start_noise()).with_effects({"motor_lag": lag.neutral(POINT)})
     data.settle(neutral)
     begun = data.fit_noise(neutral)
     left = begun.with_effects({"torque_scale": {"scale": 0.925}})
@@ -218,8 +219,8 @@ def test_a_second_look_that_diverges_takes_nothing_away(monkeypatch):
 
     settled = []
     monkeypatch.setattr(always, "refine_base", refined)
-    monkeypatch.setattr(always, "remembering_anew", lambda data, point: point)
-    found = refine_anew(SimpleNamespace(settle=settled.append), POINT, ())
+    monkeypatch.setattr(always, "with_torque_memory_refit", lambda data, point: point)
+    found = refine_with_memory(SimpleNamespace(settle=settled.append), POINT, ())
     assert found.loglik == 3.0
     assert settled == [POINT]
     assert looks == []

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Model, Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.physics.effects.effect import Situation
@@ -107,7 +107,7 @@ def test_what_a_force_changes_in_the_velocity_that_is_shown_is_a_difference_of_l
         "linear_drag": {"x": 0.01, "y": 0.01},
         "wind": {"x": 0.5},
     }
-    point = Point(DRONE, effects, first_guess())
+    point = Point(DRONE, effects, start_noise())
     model = Model(flight)
     model.settle(point, passes=4)
     column = Candidate(effect, (), ("x",)).columns(point)
@@ -145,7 +145,7 @@ def test_lags_of_the_log_are_found(name, parameter, lags):
     for lag in lags:
         recording = behind(fly(seconds=12.0, seed=5, rate_noise=2e-3, shake=0.05), name, lag)
         data = Data([flight_of(recording, DRONE)])
-        point = nominal(data, Point(DRONE, {}, first_guess()))
+        point = nominal(data, Point(DRONE, {}, start_noise()))
         begun = point.with_effects({"onboard_filter": {"rate_lag": 0.0, "velocity_lag": 0.0}})
         found.append(refine_base(data, begun, [free]).point.effects["onboard_filter"][parameter])
     assert found[1] - found[0] == pytest.approx(lags[1], abs=0.3e-3)
@@ -157,7 +157,7 @@ def test_a_torque_that_the_model_lacks_is_no_bias_of_a_late_gyro():
     recording = behind(fly(Hidden(thrust=(0.95, 0.95, 1.0, 1.0)), seconds=10.0, rate_noise=2e-3), "body_rate", 1.2e-3)
     data = Data([flight_of(recording, DRONE)])
     bias = Candidate("gyro_bias", (), ("x", "y", "z"))
-    point = nominal(data, Point(DRONE, {}, first_guess()))
+    point = nominal(data, Point(DRONE, {}, start_noise()))
     begun = refine_base(data, point, ()).point.with_effects({"gyro_bias": dict.fromkeys("xyz", 0.0)})
     found = refine_base(data, begun, [bias]).point
     assert found.noise.disturbance[3:5].max() > 1.0  # the filter carries the torque along as a disturbance

@@ -6,7 +6,7 @@ from closed_loop import DRONE, Hidden, fly
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming.onset import ONSET, onset_of
 
@@ -15,7 +15,7 @@ ROTOR = Candidate("rotor_fault", (("rotor", 2), (ONSET, None)), ("scale",))
 
 def found(hidden: Hidden) -> Candidate | None:
     data = Data([flight_of(fly(hidden, seconds=9.0, seed=5), DRONE)])
-    point = nominal(data, Point(DRONE, {}, first_guess()))
+    point = nominal(data, Point(DRONE, {}, start_noise()))
     return onset_of(data, point, ROTOR, data.gram(point, ROTOR.columns(point)), [0])
 
 

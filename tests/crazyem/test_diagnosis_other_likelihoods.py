@@ -15,7 +15,7 @@ from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.document import text_of
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.flights.flight import flight_of, without
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.locating.place import Place
@@ -44,7 +44,7 @@ def with_values(recording, name, change):
 def fitted(recording):
     vehicle = load_vehicle("cf2")
     data = Data([flight_of(recording, vehicle)])
-    return data, nominal(data, Point(vehicle, {}, first_guess()))
+    return data, nominal(data, Point(vehicle, {}, start_noise()))
 
 
 @pytest.mark.slow
@@ -123,7 +123,7 @@ def test_moving_air_has_a_memory(memory, found):
         return replace(point, noise=replace(point.noise, disturbance=spread))
 
     data = SimpleNamespace(flights=[SimpleNamespace(duration=60.0)], loglik=loglik, fit_noise=fit_noise)
-    gusts = find_gusts(data, Point(load_vehicle("cf2"), {}, first_guess()))
+    gusts = find_gusts(data, Point(load_vehicle("cf2"), {}, start_noise()))
     assert (gusts is not None) == found
     assert gusts is None or gusts.memory == pytest.approx(memory, rel=1e-6)
 
@@ -133,7 +133,7 @@ def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(m
     found = Gusts(5000.0, np.ones(3), 4.0, 3e4, True, 1.6, 0.05)
     monkeypatch.setattr("crazyem.diagnosis.naming.other_likelihoods.find_gusts", lambda data, point: found)
     vehicle, remains = load_vehicle("cf2"), Unexplained((), 0.0)
-    data, point = Data(()), Point(vehicle, {}, first_guess())
+    data, point = Data(()), Point(vehicle, {}, start_noise())
     (named,) = other_likelihoods(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
     assert named.parameters["correlation_time"].ci95 == (0.01, 100.0)
     assert named.parameters["standard_deviation"].ci95 == pytest.approx((1.502, 1.698))
@@ -148,7 +148,7 @@ def test_gusts_are_as_sure_as_what_they_leave_allows(monkeypatch, nats, confiden
     monkeypatch.setattr("crazyem.diagnosis.naming.other_likelihoods.find_gusts", lambda data, point: air)
     where = Finding("attitude", "y", "changes at 7 s", "time", (7.0, 28.0), 0.04, 0.005, "rad", nats, 1e-7)
     remains = Unexplained((where,) if nats else (), 0.0)
-    data, point = Data(()), Point(load_vehicle("cf2"), {}, first_guess())
+    data, point = Data(()), Point(load_vehicle("cf2"), {}, start_noise())
     (named,) = other_likelihoods(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
     assert named.confidence == pytest.approx(confidence, abs=1e-3)
 

@@ -10,7 +10,7 @@ from closed_loop import DRONE, Hidden, fly
 from crazyem.diagnosis.diagnose import Diagnosis, diagnose
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.naming import place_rivals
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.workers import Workers
@@ -69,7 +69,7 @@ def asked(
     left: float = 30.0,
 ) -> Selection:
     """Wind and a drag, worth `named` nats, against a force by place and the drag, worth `force`."""
-    bare = Point(vehicle, {}, first_guess())
+    bare = Point(vehicle, {}, start_noise())
     point = bare.with_effects({"wind": {"x": 1.0, "y": 0.0, "z": 0.0}, "linear_drag": {"x": 0.01, "y": 0.0, "z": 0.0}})
     steps = tuple(Step((), Trial(c, 50.0, 50.0, 1.0, 1e-9, 50.0)) for c in (WIND, DRAG))
     selection = Selection(bare, point, steps, (WIND, DRAG), SimpleNamespace(), 30)  # type: ignore[arg-type]
@@ -85,7 +85,7 @@ def asked(
 
     monkeypatch.setattr(place_rivals, "left_by_place", lambda data, point: left)
     monkeypatch.setattr(place_rivals, "refine_base", fitted)
-    monkeypatch.setattr(place_rivals, "remembering_anew", lambda data, at: at)
+    monkeypatch.setattr(place_rivals, "with_torque_memory_refit", lambda data, at: at)
     monkeypatch.setattr(place_rivals, "_finding", lambda data, found, nats: SimpleNamespace(nats=nats))
     found, finding = place_rivals.by_place(data, None, selection)  # type: ignore[arg-type]
     assert (finding is None) == (found is selection)

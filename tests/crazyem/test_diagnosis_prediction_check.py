@@ -9,10 +9,10 @@ from closed_loop import DRONE, fly
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.diagnosis.naming.prediction_check import ratio, with_found, without_what_misleads
+from crazyem.diagnosis.naming.prediction_check import ratio, with_accepted_effects, without_worse_predictions
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.prediction.horizon import UNITS, HorizonErrors
 from crazyem.diagnosis.settings import SELECTION
@@ -23,7 +23,7 @@ DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
 
 def selected(data: Data, found: dict[str, tuple[Candidate, dict[str, float]]]) -> Selection:
     """A selection with effects of these sizes, whatever the flights say."""
-    point = nominal(data, Point(DRONE, {}, first_guess()))
+    point = nominal(data, Point(DRONE, {}, start_noise()))
     begun = point.with_effects({name: values for name, (_, values) in found.items()})
     candidates = [c for c, _ in found.values()]
     fitted = refine_base(data, begun, candidates, rounds=1, noise=False)
@@ -46,7 +46,7 @@ def inertias(factor: float) -> dict[str, float]:
 def test_what_is_right_stays(heavy):
     recording, data = heavy
     selection = selected(data, {"inertia": (INERTIA, inertias(1.25))})
-    assert without_what_misleads(data, selection, DRONE, [recording]) is selection
+    assert without_worse_predictions(data, selection, DRONE, [recording]) is selection
 
 
 def test_what_leads_astray_goes_and_what_does_not_stays(heavy):
@@ -55,7 +55,7 @@ def test_what_leads_astray_goes_and_what_does_not_stays(heavy):
     harmless = dict.fromkeys(DRAG.free, 1e-6)
     selection = selected(data, {"linear_drag": (DRAG, harmless), "inertia": (INERTIA, inertias(0.4))})
     said: list[str] = []
-    left = without_what_misleads(data, selection, DRONE, [recording], say=said.append)
+    left = without_worse_predictions(data, selection, DRONE, [recording], say=said.append)
     assert [c.effect for c in left.accepted] == ["linear_drag"]
     assert [s.taken.candidate.effect for s in left.steps if s.taken] == ["linear_drag"]
     assert len(said) == 1
@@ -66,22 +66,22 @@ def test_nothing_is_asked_where_the_turning_does_not_follow_the_commands(heavy):
     recording, data = heavy
     selection = selected(data, {"inertia": (INERTIA, inertias(0.4))})
     coarse = Data([replace(m.flight, coarse=True) for m in data.models])
-    assert without_what_misleads(coarse, selection, DRONE, [recording]) is selection
+    assert without_worse_predictions(coarse, selection, DRONE, [recording]) is selection
 
 
 def test_a_recording_without_whole_states_judges_nothing(heavy):
     recording, data = heavy
     selection = selected(data, {"inertia": (INERTIA, inertias(0.4))})
     blind = replace(recording, signals={n: s for n, s in recording.signals.items() if n != "attitude"})
-    assert without_what_misleads(data, selection, DRONE, [blind]) is selection
+    assert without_worse_predictions(data, selection, DRONE, [blind]) is selection
 
 
 def test_the_vehicle_has_what_was_accepted_and_what_it_had(heavy):
     _, data = heavy
     selection = selected(data, {"inertia": (INERTIA, inertias(0.4))})
     filed = replace(DRONE, effects={"linear_drag": {"x": 0.01}})
-    assert with_found(filed, selection, ()).effects == filed.effects
-    assert with_found(filed, selection, selection.accepted).effects["inertia"] == inertias(0.4)
+    assert with_accepted_effects(filed, selection, ()).effects == filed.effects
+    assert with_accepted_effects(filed, selection, selection.accepted).effects["inertia"] == inertias(0.4)
 
 
 def errors(factor: float) -> HorizonErrors:

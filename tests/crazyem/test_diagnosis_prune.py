@@ -11,12 +11,12 @@ from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.fitting.nuisances import on_held_out, refine_base
+from crazyem.diagnosis.fitting.noise import start_noise
+from crazyem.diagnosis.fitting.nuisances import held_out_fit, refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import prune
-from crazyem.diagnosis.naming.detection_limits import at_the_end, matters
-from crazyem.diagnosis.naming.select import shortlist, with_started
+from crazyem.diagnosis.naming.detection_limits import exceeds_limit, is_implausible
+from crazyem.diagnosis.naming.select import at_linear_size, shortlist
 from crazyem.diagnosis.naming.trials import Step, Trial, significance
 from crazyem.diagnosis.settings import SELECTION
 from crazyem.diagnosis.workers import Workers
@@ -25,7 +25,7 @@ from crazyem.physics.effects.prior import Conditions
 
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
 TAKEN = Step((), Trial(DRAG, gain=30.0, held_out=20.0, dispersion=2.0, p_value=1e-6, evidence=12.0))
-POINT = Point(DRONE, {}, first_guess())
+POINT = Point(DRONE, {}, start_noise())
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def test_what_is_expected_on_flights_held_out_is_what_their_likelihood_would_los
     here = fitted.point.effects["torque_scale"]["scale"]
     scales = here + np.linspace(-0.03, 0.03, 7)  # what is always free stays within its bounds
     points = [fitted.point.with_effects({"torque_scale": {"scale": s}}) for s in scales]
-    values = [on_held_out(apart, p, [candidate]).loglik for p in points]
+    values = [held_out_fit(apart, p, [candidate]).loglik for p in points]
     bend = np.polynomial.Polynomial.fit(scales, values, 2).deriv(2)(here)
     found = prune.expected(apart, fitted, [candidate], candidate)
     wanted = -0.5 * bend * (here - 1.0) ** 2
@@ -112,7 +112,7 @@ def test_what_holds_another_within_its_range_stays(monkeypatch, slope, kept):
     steps = [replace(TAKEN, taken=replace(TAKEN.taken, candidate=c)) for c in (scale, curve)]
     lost = {scale: 5.0, curve: 300.0}
     fits = {c: SimpleNamespace(point=alone, loglik=-nats) for c, nats in lost.items()}
-    monkeypatch.setattr(prune, "bare_fit", lambda data, held_out, fitted, accepted, c: (fits[c], 0.0))
+    monkeypatch.setattr(prune, "fit_without", lambda data, held_out, fitted, accepted, c: (fits[c], 0.0))
     monkeypatch.setattr(prune, "refine_base", lambda *a, **k: bare)
     data = SimpleNamespace(loglik=lambda point, passes: 0.0, settle=lambda point: None, workers=Workers(1))
     found, accepted, left = prune.backward_elimination(data, fitted, [scale, curve], steps, None, lambda text: None)
@@ -133,8 +133,8 @@ def test_flights_held_out_are_asked_where_they_can_answer(monkeypatch, expected,
     fitted = SimpleNamespace(point=POINT, loglik=0.0)
     bare = SimpleNamespace(point=POINT, loglik=-300.0)
     monkeypatch.setattr(prune, "expected", lambda *a: expected)
-    monkeypatch.setattr(prune, "bare_fit", lambda *a: (bare, -held))
-    monkeypatch.setattr(prune, "on_held_out", lambda *a: SimpleNamespace(loglik=0.0))
+    monkeypatch.setattr(prune, "fit_without", lambda *a: (bare, -held))
+    monkeypatch.setattr(prune, "held_out_fit", lambda *a: SimpleNamespace(loglik=0.0))
     monkeypatch.setattr(prune, "refine_base", lambda *a, **k: bare)
     data = SimpleNamespace(loglik=lambda point, passes: 0.0, workers=Workers(1))
     monkeypatch.setattr(prune, "nuisances", lambda *a: [])
@@ -157,8 +157,8 @@ def test_what_no_flight_needs_goes_before_what_one_speaks_against(monkeypatch):
         return SimpleNamespace(point=POINT, loglik=-nats), -held
 
     monkeypatch.setattr(prune, "expected", lambda *a: 280.0)
-    monkeypatch.setattr(prune, "bare_fit", bare_fit)
-    monkeypatch.setattr(prune, "on_held_out", lambda *a: SimpleNamespace(loglik=0.0))
+    monkeypatch.setattr(prune, "fit_without", bare_fit)
+    monkeypatch.setattr(prune, "held_out_fit", lambda *a: SimpleNamespace(loglik=0.0))
     monkeypatch.setattr(prune, "refine_base", lambda *a, **k: fitted)
     monkeypatch.setattr(prune, "nuisances", lambda *a: [])
     data = SimpleNamespace(loglik=lambda point, passes: 0.0, settle=lambda point: None, workers=Workers(1))
@@ -172,16 +172,16 @@ def test_what_no_flight_needs_goes_before_what_one_speaks_against(monkeypatch):
 def test_one_number_at_the_end_of_its_range_is_no_finding():
     slope = Candidate("thrust_curve", (), ("slope_error",))
     low = slope.parameter("slope_error").low
-    assert not matters(POINT.with_effects({"thrust_curve": {"slope_error": low}}), slope)
-    assert matters(POINT.with_effects({"thrust_curve": {"slope_error": low + 1e-6}}), slope)
-    assert not matters(POINT.with_effects({"thrust_curve": {"slope_error": 0.02}}), slope)
+    assert not exceeds_limit(POINT.with_effects({"thrust_curve": {"slope_error": low}}), slope)
+    assert exceeds_limit(POINT.with_effects({"thrust_curve": {"slope_error": low + 1e-6}}), slope)
+    assert not exceeds_limit(POINT.with_effects({"thrust_curve": {"slope_error": 0.02}}), slope)
     spun = Candidate("rotor_inertia", (), ("inertia",))  # no propeller is as light
-    assert not matters(POINT.with_effects({"rotor_inertia": {"inertia": 1.9e-9}}), spun)
-    assert matters(POINT.with_effects({"rotor_inertia": {"inertia": 5e-9}}), spun)
-    assert matters(POINT.with_effects({"linear_drag": {"x": 0.0, "y": 0.01, "z": 0.0}}), DRAG)  # one of three
+    assert not exceeds_limit(POINT.with_effects({"rotor_inertia": {"inertia": 1.9e-9}}), spun)
+    assert exceeds_limit(POINT.with_effects({"rotor_inertia": {"inertia": 5e-9}}), spun)
+    assert exceeds_limit(POINT.with_effects({"linear_drag": {"x": 0.0, "y": 0.01, "z": 0.0}}), DRAG)  # one of three
     for axis, size, counts in (("y", 1.2e-3, True), ("y", 0.8e-3, False), ("z", 2e-3, False), ("z", 4e-3, True)):
         point = POINT.with_effects({"linear_drag": {"x": 0.0, "y": 0.0, "z": 0.0, axis: size}})
-        assert matters(point, DRAG) == counts
+        assert exceeds_limit(point, DRAG) == counts
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_a_moment_that_no_rotor_makes_counts_from_a_larger_size_on(roll, pitch, 
     """Air on rotors above the centre of mass tips the drone back; what tips it onward is feigned where it is small."""
     moment = Candidate("velocity_moment", (), ("roll_per_vy", "pitch_per_vx"))
     point = POINT.with_effects({"velocity_moment": {"roll_per_vy": roll, "pitch_per_vx": pitch}})
-    assert matters(point, moment) == counts
+    assert exceeds_limit(point, moment) == counts
 
 
 def test_a_rotor_that_is_much_stronger_than_the_others_is_no_faulty_one():
@@ -206,7 +206,7 @@ def test_a_rotor_that_is_much_stronger_than_the_others_is_no_faulty_one():
     assert 1.0 < high < 1.2
     for scale, counts in ((0.8, True), (1.05, True), (high, False)):
         point = POINT.with_effects({"rotor_fault": {"rotor": 2, "scale": scale, "onset_time": None}})
-        assert matters(point, fault) == counts
+        assert exceeds_limit(point, fault) == counts
 
 
 def test_no_rotor_gets_stronger_in_flight():
@@ -222,8 +222,8 @@ def test_a_drag_that_no_air_has_stands_for_something_else():
     ):  # fmt: skip
         point = POINT.with_effects({drag: {"x": 0.01, "y": size * DRONE.mass, "z": 0.0}})
         candidate = Candidate(drag, (), ("x", "y", "z"))
-        assert matters(point, candidate) == counts
-        assert at_the_end(point, candidate) != counts
+        assert exceeds_limit(point, candidate) == counts
+        assert is_implausible(point, candidate) != counts
 
 
 def test_wind_that_only_sinks_is_thrust_that_is_a_little_wrong():
@@ -234,15 +234,15 @@ def test_wind_that_only_sinks_is_thrust_that_is_a_little_wrong():
         (DRONE, (-0.11, 0.03, 1.7), False), (DRONE, (1.0, 1.0, 1.7), True), (trimmed, (0.2, 0.0, 0.0), False),
         (trimmed, (0.9, 0.9, 0.0), True),
     ):  # fmt: skip
-        point = Point(vehicle, {"wind": dict(zip("xyz", values, strict=True))}, first_guess())
-        assert matters(point, wind) == counts
+        point = Point(vehicle, {"wind": dict(zip("xyz", values, strict=True))}, start_noise())
+        assert exceeds_limit(point, wind) == counts
 
 
 def test_a_ground_effect_that_does_not_fade_is_thrust_that_is_a_little_wrong():
     lifting = Candidate("ground_effect", (), ("strength", "height"))
     for height, counts in ((0.1, True), (0.5, True), (10.0, False)):
         point = POINT.with_effects({"ground_effect": {"strength": 0.09, "height": height}})
-        assert matters(point, lifting) == counts
+        assert exceeds_limit(point, lifting) == counts
 
 
 def test_a_scale_of_velocities_must_be_more_than_the_jitter_of_the_estimate():
@@ -259,15 +259,15 @@ def test_a_thrust_within_what_days_differ_by_is_no_finding_of_a_drone_with_a_fil
     thrust = Candidate("thrust_scale", (), ("scale",))
     for scale, new, filed in ((1.03, True, False), (0.95, True, True), (1.05, True, True)):
         there = {"thrust_scale": {"scale": scale}}
-        assert matters(POINT.with_effects(there), thrust) == new
-        assert matters(trimmed.with_effects(there), thrust) == filed
+        assert exceeds_limit(POINT.with_effects(there), thrust) == new
+        assert exceeds_limit(trimmed.with_effects(there), thrust) == filed
 
 
 def test_a_load_counts_from_a_share_of_the_drone_s_mass_on_whatever_its_length():
     load = Candidate("suspended_load", (), ("mass", "length"))
     few, some = (POINT.with_effects({"suspended_load": {"mass": m, "length": 1.5}}) for m in (2.5e-4, 4e-4))
-    assert not matters(few, load)
-    assert matters(some, load)
+    assert not exceeds_limit(few, load)
+    assert exceeds_limit(some, load)
 
 
 def test_beside_a_load_less_thrust_than_its_swing_leaves_open_of_its_weight_is_none():
@@ -280,8 +280,8 @@ def test_beside_a_load_less_thrust_than_its_swing_leaves_open_of_its_weight_is_n
         (more, {"payload": {"mass": 0.006 * DRONE.mass}}, False),
         (more, {"payload": {"mass": 0.02 * DRONE.mass}}, True),
     ):
-        assert matters(POINT.with_effects(values), candidate, data)  # without a load
-        assert matters(POINT.with_effects({**load, **values}), candidate, data) == counts
+        assert exceeds_limit(POINT.with_effects(values), candidate, data)  # without a load
+        assert exceeds_limit(POINT.with_effects({**load, **values}), candidate, data) == counts
 
 
 def test_a_load_is_as_significant_as_its_mass():
@@ -316,7 +316,7 @@ def test_heavy_rotors_are_fitted_beside_a_damping_from_where_they_are_heavy():
     damping, drag, rotors = entry("rate_damping", 200.0), entry("linear_drag", 50.0), entry("rotor_inertia", 0.0, 1.0)
     *_, (trial, _) = shortlist([damping, drag, rotors])
     assert trial.candidate.effect == "rotor_inertia"
-    begun = with_started(POINT, trial.candidate, SimpleNamespace(theta=np.array([-1e-7])))
+    begun = at_linear_size(POINT, trial.candidate, SimpleNamespace(theta=np.array([-1e-7])))
     assert begun.effects["rotor_inertia"]["inertia"] == 5e-8  # derivatives at none do not lead there
     assert [t.candidate.effect for t, _ in shortlist([drag, rotors])] == ["linear_drag"]
     found = [entry("rotor_inertia", 300.0), damping]  # by its derivative: once is enough

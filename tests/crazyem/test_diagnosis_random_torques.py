@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Noise, Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.random_torques import (
     amplitude_of,
@@ -124,7 +124,7 @@ def test_a_hump_reaches_as_far_as_it_stands_out(half: float, wanted: float) -> N
 def test_a_flight_that_shakes() -> None:
     """3 rad/s^2 in roll and pitch about 6 Hz: found there with its torque; beside the hump little is known of it."""
     data = Data([flight_of(fly(vibration=3.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, first_guess()))
+    point = nominal(data, Point(DRONE, {}, start_noise()))
     found = humps(data.models[0], point)
     assert {f.axis for f in found} == {"x", "y"}
     for f, inertia in zip(sorted(found, key=lambda f: f.axis), DRONE.inertia, strict=False):
@@ -139,7 +139,7 @@ def test_a_flight_that_shakes() -> None:
 
 def test_a_healthy_made_flight_has_neither() -> None:
     data = Data([flight_of(fly(seconds=7.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, first_guess()))
+    point = nominal(data, Point(DRONE, {}, start_noise()))
     assert not humps(data.models[0], point)
     assert erratic_rotor(data.models, point) is None
 
@@ -164,7 +164,7 @@ def test_torques_that_products_of_inertia_turn_into_rates_are_no_rotor(share: fl
 def test_what_a_filter_remembers_is_an_innovation_again() -> None:
     """Torques with a memory hide how the axes go together: most of it is foreseen. Without, noise takes their place."""
     data = Data([flight_of(fly(seconds=7.0, sway=6.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, first_guess()))
+    point = nominal(data, Point(DRONE, {}, start_noise()))
     assert point.noise.disturbance[3:].max() > 1.0
     quiet = memoryless(data.twin(), point)
     assert not quiet.noise.disturbance[3:].any()
@@ -175,7 +175,7 @@ def test_what_a_filter_remembers_is_an_innovation_again() -> None:
 def test_a_made_rotor_that_pushes_at_random_is_told() -> None:
     """By 4 mN with a memory of 0.05 s, for a roll of 4 mN times the arm: which rotor, and about how much."""
     data = Data([flight_of(fly(sticking=4e-3, seconds=14.0), DRONE)])
-    quiet = memoryless(data, nominal(data, Point(DRONE, {}, first_guess())))
+    quiet = memoryless(data, nominal(data, Point(DRONE, {}, start_noise())))
     data.settle(quiet)
     found = erratic_rotor(data.models, quiet)
     assert found is not None

@@ -13,7 +13,7 @@ from crazyem.diagnosis.fitting import specific_force
 from crazyem.diagnosis.flights.alignment import Alignment
 from crazyem.diagnosis.flights.flight import Flight, controlled_rates, flight_of, without
 from crazyem.diagnosis.flights.inputs import inputs_of
-from crazyem.diagnosis.flights.recording_nuisances import owned
+from crazyem.diagnosis.flights.recording_nuisances import nuisances_of_recordings
 from crazyem.diagnosis.prediction.predict import predict, recorded
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
@@ -114,7 +114,7 @@ def test_it_is_used_and_said() -> None:
 
 def test_a_diagnosis_tells_it_of_each_recording() -> None:
     late, unknown = (flight_of(shaken(delay=0.02, related=r), VEHICLE) for r in (True, False))
-    one, other = owned([late], [unknown])
+    one, other = nuisances_of_recordings([late], [unknown])
     assert one.to_json()["rotor_clock"]["delay"] == pytest.approx(0.02, abs=1e-3)
     assert any("after their stamps" in text for text in one.notices)
     assert (one.held_out, other.held_out) == (False, True)

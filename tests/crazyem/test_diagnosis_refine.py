@@ -11,7 +11,7 @@ from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, refine
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Column, Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.settings import FITTING
 
@@ -44,7 +44,7 @@ class Falling(Data):
 
 
 def begun(data: Data) -> Point:
-    point = Point(DRONE, {"linear_drag": {"x": 0.0, "y": 0.0, "z": 0.0}}, first_guess())
+    point = Point(DRONE, {"linear_drag": {"x": 0.0, "y": 0.0, "z": 0.0}}, start_noise())
     data.settle(point)
     return data.fit_noise(point)
 
@@ -72,7 +72,7 @@ def test_a_fit_ends_where_a_plain_search_does_and_a_second_one_takes_no_step():
 def test_a_step_that_fails_is_tried_smaller_only_where_something_is_to_be_gained(depth: float, tries: int) -> None:
     """The step is 0.1: of 1000 nats lost a third of it may be worth a look, of 0.03 not."""
     data = Falling(depth)
-    point = Point(DRONE, {"linear_drag": {"x": 0.0, "y": 0.0, "z": 0.0}}, first_guess())
+    point = Point(DRONE, {"linear_drag": {"x": 0.0, "y": 0.0, "z": 0.0}}, start_noise())
     found = refine(data, point, [DRAG], noise=False)
     assert data.asked == pytest.approx([0.0, *(0.1 / 3**k for k in range(tries))])
     assert found.point.effects["linear_drag"]["y"] == 0.0

@@ -12,7 +12,14 @@ from scipy.special import expit
 from crazyem.diagnosis import diagnose as diagnosing
 from crazyem.diagnosis.flights.inputs import inputs_of
 from crazyem.diagnosis.naming.other_likelihoods import late_rotors
-from crazyem.diagnosis.naming.rotor_response import Answer, Response, answers, disobedient, late_response, response
+from crazyem.diagnosis.naming.rotor_response import (
+    Answer,
+    Response,
+    answers,
+    late_response,
+    response,
+    unresponsive_rotor,
+)
 from crazyem.diagnosis.settings import CONFIDENCE, ROTOR_RESPONSE, SELECTION
 from crazyem.recordings.recording import Recording
 
@@ -155,7 +162,7 @@ def test_wild_and_slow_samples_are_refused(flown):
 @pytest.mark.parametrize("rotor", [1, 4])
 def test_a_rotor_that_sticks_is_told_by_what_it_leaves_of_its_command(flown, rotor):
     sticking = [answering(flown, 0.03, 0.0, seed=s, sticks={rotor: 0.1}) for s in (0, 1)]
-    told = disobedient(answers(sticking, ROTORS))
+    told = unresponsive_rotor(answers(sticking, ROTORS))
     assert told is not None
     assert told.regime == f"rotor {rotor} does not follow its command"
     assert (told.signal, told.axis, told.unit, told.variable) == ("force", "z", "N", "rotor")
@@ -167,11 +174,14 @@ def test_a_rotor_that_sticks_is_told_by_what_it_leaves_of_its_command(flown, rot
 
 def test_a_rotor_that_sticks_in_one_flight_only_or_as_all_do_is_not_told(flown):
     whole = answering(flown, 0.03, 0.0, seed=2, noise=1e-3)
-    assert disobedient(answers([whole], ROTORS)) is None
-    assert disobedient(answers([], ROTORS)) is None
-    assert disobedient(answers([flown], ROTORS)) is None  # no speeds
-    assert disobedient(answers([answering(flown, 0.03, 0.0, sticks={2: 0.05}), whole], ROTORS)) is None
-    assert disobedient(answers([answering(flown, 0.03, 0.0, sticks=dict.fromkeys((1, 2, 3, 4), 0.03))], ROTORS)) is None
+    assert unresponsive_rotor(answers([whole], ROTORS)) is None
+    assert unresponsive_rotor(answers([], ROTORS)) is None
+    assert unresponsive_rotor(answers([flown], ROTORS)) is None  # no speeds
+    assert unresponsive_rotor(answers([answering(flown, 0.03, 0.0, sticks={2: 0.05}), whole], ROTORS)) is None
+    assert (
+        unresponsive_rotor(answers([answering(flown, 0.03, 0.0, sticks=dict.fromkeys((1, 2, 3, 4), 0.03))], ROTORS))
+        is None
+    )
 
 
 def behind(time, wanted, *, lag):

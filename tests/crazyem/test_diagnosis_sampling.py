@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import nuisances
 from crazyem.diagnosis.fitting.sampling import unlogged_share
 from crazyem.diagnosis.flights.flight import thinned
@@ -79,7 +79,7 @@ def test_smooth_commands_and_measured_speeds_miss_nothing() -> None:
 
 def priors(flight: Any) -> dict[str, NDArray]:
     data: Any = SimpleNamespace(flights=[flight], constrained=frozenset())
-    found = nuisances(data, Point(DRONE, {}, first_guess()), ())
+    found = nuisances(data, Point(DRONE, {}, start_noise()), ())
     return {c.effect: np.array(precision) ** -0.5 for c, precision in found}
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.fitting.model import Model, Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.situation import causal_middle, impulses
 from crazyem.diagnosis.flights.flight import flight_of
 
@@ -63,9 +63,9 @@ def test_what_is_remembered_is_of_the_last_path():
     }
     there = []
     for mass in (0.0, 0.01):
-        point = Point(DRONE, {**lags, "payload": {"mass": mass, "x": 0.0, "y": 0.0, "z": 0.0}}, first_guess())
+        point = Point(DRONE, {**lags, "payload": {"mass": mass, "x": 0.0, "y": 0.0, "z": 0.0}}, start_noise())
         model.settle(point)
-        forgetful = replace(model, _thrusts={}, _there=None, _as_shown=None, _offsets={})
+        forgetful = replace(model, _thrusts={}, _path_situation=None, _row_situation=None, _offsets={})
         expected, _ = forgetful.accelerations(point)
         for _ in range(2):
             found, _ = model.accelerations(point)

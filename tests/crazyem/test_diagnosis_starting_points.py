@@ -16,19 +16,19 @@ from crazyem.diagnosis.fitting.candidates import Candidate, variants
 from crazyem.diagnosis.fitting.divergence import diverges
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Model, Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import starting_points
-from crazyem.diagnosis.naming.select import shortlist, with_started
-from crazyem.diagnosis.naming.starting_points import best_begun, larger, peaks
+from crazyem.diagnosis.naming.select import at_linear_size, shortlist
+from crazyem.diagnosis.naming.starting_points import best_starting_points, likeliest_start, peaks
 from crazyem.diagnosis.naming.trials import Trial
 from crazyem.diagnosis.settings import SELECTION
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 LOAD = CATALOGUE["suspended_load"]
-POINT = Point(DRONE, {}, first_guess())
+POINT = Point(DRONE, {}, start_noise())
 
 
 @given(st.lists(st.floats(0, 1e6), min_size=1, max_size=30))
@@ -53,7 +53,7 @@ def test_a_load_is_begun_at_the_length_whose_swing_the_flight_shows(length):
     data = Data([flight_of(recording, DRONE)])
     point = refine_base(data, nominal(data, POINT), ()).point
     candidates = [*variants(LOAD, point, data.signals), Candidate("thrust_scale", (), ("scale",))]
-    left = best_begun(data, point, (), candidates)
+    left = best_starting_points(data, point, (), candidates)
     assert candidates[-1] in left  # has one beginning only
     begun = left[:-1]
     assert 1 <= len(begun) <= SELECTION.peaks
@@ -89,13 +89,13 @@ class Likely:
 def test_a_load_that_is_followed_only_by_one_as_heavy_is_begun_with_its_mass(height, found):
     point = POINT.with_effects({"thrust_scale": {"scale": 0.9}})
     family = variants(LOAD, point, frozenset({"position", "velocity"}))
-    begun = larger(Likely(0.0018, 0.25, height), point, family)
+    begun = likeliest_start(Likely(0.0018, 0.25, height), point, family)
     assert (begun is not None) == found
     if begun is not None:
         assert begun.likeliest
         assert dict(begun.begin)["length"] == pytest.approx(0.25, rel=0.05)
         assert dict(begun.begin)["mass"] == 0.002  # the nearest, by ratio
-        started = with_started(POINT, begun, SimpleNamespace(theta=np.array([9.0, -0.004, 0.2])))
+        started = at_linear_size(POINT, begun, SimpleNamespace(theta=np.array([9.0, -0.004, 0.2])))
         assert started.effects["suspended_load"] == dict(begun.begin)  # whatever derivatives say
 
 
@@ -115,11 +115,11 @@ def test_what_is_begun_by_its_likelihood_is_tried_whatever_derivatives_say():
 def test_where_a_flight_drives_loads_astray_the_likeliest_is_begun_with_alone(monkeypatch, chaotic):
     data = Data([flight_of(fly(Hidden(load=(0.0015, 0.5)), seconds=10.0), DRONE)])
     point = refine_base(data, nominal(data, POINT), ()).point
-    data.models[0]._strays["suspended_load"] = chaotic
+    data.models[0]._diverging["suspended_load"] = chaotic
     family = variants(LOAD, point, data.signals)
     likeliest = replace(family[7], begin=(*family[7].begin, ("mass", 0.004)))
-    monkeypatch.setattr(starting_points, "larger", lambda data, point, family: likeliest)
-    begun = best_begun(data, point, (), family)
+    monkeypatch.setattr(starting_points, "likeliest_start", lambda data, point, family: likeliest)
+    begun = best_starting_points(data, point, (), family)
     assert (begun == [likeliest]) == chaotic
     assert chaotic or set(begun) <= set(family)
 
@@ -141,11 +141,11 @@ def test_a_load_is_followed_by_its_pull_only_where_a_flight_drives_it_astray(cha
     model = Model(flight_of(fly(seconds=8.0), DRONE))
     point = POINT.with_effects({"suspended_load": {"mass": 0.002, "length": 0.3}})
     model.settle(point)
-    model._strays["suspended_load"] = chaotic
+    model._diverging["suspended_load"] = chaotic
     before = model.accelerations(point)[0]
     at = model.flight.time.size // 2
-    model.seen = model.seen.copy()
-    model.seen[at : at + 100, 0] += 0.5
+    model.observed_force = model.observed_force.copy()
+    model.observed_force[at : at + 100, 0] += 0.5
     after = model.accelerations(point)[0]
     assert np.array_equal(before[: at + 1], after[: at + 1])
     assert np.array_equal(before, after) != chaotic

@@ -13,19 +13,19 @@ from crazyem.diagnosis.fitting import sweeps
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, nominal
 from crazyem.diagnosis.fitting.model import Noise, Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
-from crazyem.diagnosis.fitting.sampling import held
+from crazyem.diagnosis.fitting.sampling import mean_torque
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import prune as pruning
 from crazyem.diagnosis.naming import select as selecting
 from crazyem.diagnosis.naming import steady as steadying
-from crazyem.diagnosis.naming.detection_limits import matters
+from crazyem.diagnosis.naming.detection_limits import exceeds_limit
 from crazyem.diagnosis.naming.evidence import _inverse
 from crazyem.diagnosis.naming.gusts import push_of
 from crazyem.diagnosis.naming.select import Basis, shortlist, step_of
-from crazyem.diagnosis.naming.steady import as_steady, by_onsets, with_exact_torques, without_trim_rivals
-from crazyem.diagnosis.naming.trials import Selection, Trial, preferred, sure_enough
+from crazyem.diagnosis.naming.steady import onset_p_value, steady_rivals, with_exact_torques, without_trim_rivals
+from crazyem.diagnosis.naming.trials import Selection, Trial, is_significant, preferred
 from crazyem.diagnosis.settings import SELECTION, WIND
 from crazyem.diagnosis.workers import Workers
 from crazyem.recordings.recording import Recording
@@ -113,10 +113,10 @@ def test_a_centre_of_mass_is_where_the_mean_commands_are_balanced() -> None:
     flight = flight_of(flown, DRONE)
     swung = flight.inputs.thrust - flight.inputs.thrust.mean(0)
     seen = replace(flight, inputs=replace(flight.inputs, thrust=flight.inputs.thrust.mean(0) + 1.03 * swung))
-    along_x, along_y, _ = held(seen, DRONE)
+    along_x, along_y, _ = mean_torque(seen, DRONE)
     data = Data([seen])
     shifted = Candidate("center_of_mass", (), ("x", "y", "z"))
-    fitted = refine_base(data, nominal(data, Point(DRONE, {"center_of_mass": {"y": 1e-3}}, first_guess())), [shifted])
+    fitted = refine_base(data, nominal(data, Point(DRONE, {"center_of_mass": {"y": 1e-3}}, start_noise())), [shifted])
     selection: Any = Selection(fitted.point, fitted.point, (), (shifted,), fitted, 1)
     loose = fitted.point.effects["center_of_mass"]
     whole = with_exact_torques(data, selection).final.effects["center_of_mass"]
@@ -150,8 +150,8 @@ def test_what_keeps_the_freedom_of_all_torques(monkeypatch) -> None:
 
 def test_with_a_trim_that_nobody_knew_what_is_steady_is_not_told_from_it() -> None:
     trim, weak, load = trial(ASKED, 100.0), trial(WEAK, 120.0), trial(LOAD, 60.0)
-    assert as_steady(trim, [weak, load, trial(replace(ASKED, effect="wind"), 110.0)]) == (weak,)
-    assert as_steady(trim, [load]) == ()
+    assert steady_rivals(trim, [weak, load, trial(replace(ASKED, effect="wind"), 110.0)]) == (weak,)
+    assert steady_rivals(trim, [load]) == ()
     # a trim is there in any case: what explains more makes it a toss, and no worse
     assert preferred(trim, [weak]) == pytest.approx(0.5)
     assert preferred(trial(Candidate("wind", (), ("x", "y", "z")), 100.0), [weak]) < 0.01
@@ -170,7 +170,7 @@ def test_a_trim_that_is_asked_for_is_fitted_and_taken_before_a_better_weak_rotor
     assert step.taken.candidate is ASKED
     assert {t.candidate.effect for t in step.alike} == {"rotor_fault"}
     unsure: Any = [(replace(t, p_value=1e-3) if t.candidate is ASKED else t, None) for t, _ in linear]
-    monkeypatch.setattr(selecting, "compared_again", lambda basis, trials, *, say: (trials, trials[:1]))
+    monkeypatch.setattr(selecting, "compared_with_refitted_noise", lambda basis, trials, *, say: (trials, trials[:1]))
     step = step_of(Basis(data, None, filed, (), 0.0, 0.0), unsure, say=lambda text: None)
     assert step.taken is not None
     assert step.taken.candidate.effect == "rotor_fault"
@@ -185,11 +185,11 @@ def test_with_a_trim_in_the_file_an_effect_must_be_surer_and_a_date_pays_for_the
     filed = point_of(replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}}))
     assert SELECTION.daily_p_value < SELECTION.p_value
     between = (SELECTION.daily_p_value * SELECTION.p_value) ** 0.5
-    assert sure_enough(point_of(DRONE), between)
-    assert not sure_enough(filed, between)
-    assert by_onsets(filed, 1e-5, 20) == pytest.approx(2e-4)
-    assert by_onsets(filed, 0.3, 20) == 1.0
-    assert by_onsets(point_of(DRONE), 1e-5, 20) == 1e-5
+    assert is_significant(point_of(DRONE), between)
+    assert not is_significant(filed, between)
+    assert onset_p_value(filed, 1e-5, 20) == pytest.approx(2e-4)
+    assert onset_p_value(filed, 0.3, 20) == 1.0
+    assert onset_p_value(point_of(DRONE), 1e-5, 20) == 1e-5
 
 
 @pytest.mark.parametrize(
@@ -213,7 +213,7 @@ def test_a_load_counts_by_what_it_differs_from_the_file(
 
     effects: dict[str, Any] = {TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}} if trim else {}
     vehicle = replace(DRONE, effects={**effects, **({"payload": effect(filed)} if filed else {})})
-    assert matters(point_of(vehicle, payload={**effect(load), "z": 0.0}), LOAD) is another
+    assert exceeds_limit(point_of(vehicle, payload={**effect(load), "z": 0.0}), LOAD) is another
 
 
 def test_a_drag_that_is_free_near_nothing_does_not_make_a_storm_of_a_force() -> None:
@@ -253,7 +253,7 @@ def test_what_wanders_is_fitted_beside_the_flights(monkeypatch) -> None:
     """The model with disturbances is fitted on a copy: the next fit does not start from there."""
     drag = Candidate("linear_drag", (), ("x", "y", "z"))
     data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.0)), seconds=8.0, seed=3), DRONE)])
-    fitted = refine_base(data, nominal(data, Point(DRONE, {}, first_guess())).with_effects({"linear_drag": {}}), [drag])
+    fitted = refine_base(data, nominal(data, Point(DRONE, {}, start_noise())).with_effects({"linear_drag": {}}), [drag])
     seen: list[Data] = []
 
     def recorded(apart: Data, *arguments: Any, **options: Any) -> Any:

@@ -14,7 +14,7 @@ from crazyem.diagnosis.fitting.candidates import TRIM
 from crazyem.diagnosis.fitting.days import day_freedom, day_sd
 from crazyem.diagnosis.fitting.fit import local_precision, log_prior
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.naming.answer import _by_the_day
 from crazyem.diagnosis.naming.baseline import spread_of, with_baseline
 from crazyem.diagnosis.naming.steady_odds import decided_by_balance, explanations
@@ -68,7 +68,7 @@ def test_a_load_is_as_sure_as_the_day_s_thrust_and_at_the_edge_as_the_torque_tha
     shown = balance([0.1, 0.0, 0.0, 0.0])
     whole = TRIMMED.mass / 0.9
     for place, sd in ((0.01, 0.02), (0.0396, (0.02**-2 + (0.04 / 5e-4) ** 2) ** -0.5)):
-        point = Point(TRIMMED, {"payload": {"mass": 0.1 * whole, "x": 0.0, "y": place, "z": 0.0}}, first_guess())
+        point = Point(TRIMMED, {"payload": {"mass": 0.1 * whole, "x": 0.0, "y": place, "z": 0.0}}, start_noise())
         found, p_value = _by_the_day(LOAD, point, shown)  # type: ignore[misc]
         assert found["mass"].sd == pytest.approx(sd * whole / 0.9)
         assert found["y"].sd == pytest.approx(5e-4 / 0.1)

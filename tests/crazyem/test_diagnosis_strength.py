@@ -11,8 +11,8 @@ from crazyem.diagnosis.fitting.candidates import Candidate, OfRecordings, of_rec
 from crazyem.diagnosis.fitting.days import THRUST_SD
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import OWN, Point, deviations, of_recording
-from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.fitting.nuisances import differing, nuisances, refine_base
+from crazyem.diagnosis.fitting.noise import start_noise
+from crazyem.diagnosis.fitting.nuisances import nuisances, refine_base, with_thrust_scales
 from crazyem.diagnosis.flights.flight import Flight, flight_of
 from crazyem.diagnosis.settings import FITTING
 
@@ -24,13 +24,13 @@ def flights() -> list[Flight]:
         replace(flight_of(fly(Hidden(thrust=(s,) * 4), seed=k, seconds=9.0), DRONE), name=f"{k}.csv")
         for k, s in enumerate(STRONG)
     ]
-    return differing(made, [], DRONE)[0]
+    return with_thrust_scales(made, [], DRONE)[0]
 
 
 @pytest.mark.slow
 def test_each_is_found_and_the_mean_is_left_to_the_thrust_scale() -> None:
     data = Data(flights())
-    point = nominal(data, Point(DRONE, {}, first_guess()))
+    point = nominal(data, Point(DRONE, {}, start_noise()))
     scale = Candidate("thrust_scale", (), ("scale",))
     found = refine_base(data, point.with_effects({"thrust_scale": {"scale": 1.0}}), [scale]).point
     own = deviations(found.effects, "thrust_scale")
@@ -45,7 +45,7 @@ def test_a_recording_hears_of_its_own_strength_only() -> None:
     data = Data(flights()[:3])
     own = of_recordings("thrust_scale", ("scale",), data.flights)
     point = nominal(
-        data, Point(DRONE, {OWN + "thrust_scale": own.neutral(Point(DRONE, {}, first_guess()))}, first_guess())
+        data, Point(DRONE, {OWN + "thrust_scale": own.neutral(Point(DRONE, {}, start_noise()))}, start_noise())
     )
     gram = data.gram(point, own.columns(point))
     score = np.stack([gram.score[gram.flight == k].sum(0) for k in range(3)])
@@ -75,15 +75,15 @@ def test_it_is_added_to_what_all_recordings_share_and_nothing_of_the_vehicle() -
 def test_it_is_free_only_among_several_recordings_of_commands() -> None:
     some = flights()
     assert FITTING.min_thrust_flights == 3
-    two = differing(some[:2], some[2:], DRONE)
+    two = with_thrust_scales(some[:2], some[2:], DRONE)
     assert not any(f.differs for part in two for f in part)
     speeds = [replace(f, inputs=replace(f.inputs, measured=True)) for f in some]
-    assert not differing(speeds, [], DRONE)[0][0].differs
-    assert not differing([replace(f, levelled=True) for f in some], [], DRONE)[0][0].differs
+    assert not with_thrust_scales(speeds, [], DRONE)[0][0].differs
+    assert not with_thrust_scales([replace(f, levelled=True) for f in some], [], DRONE)[0][0].differs
     trimmed = replace(DRONE, effects={"trim": {"x": 0.0}})
-    assert not differing(some, [], trimmed)[0][0].differs
+    assert not with_thrust_scales(some, [], trimmed)[0][0].differs
     data = Data(some)
-    free = {c.effect: (c, p) for c, p in nuisances(data, Point(DRONE, {}, first_guess()), ())}
+    free = {c.effect: (c, p) for c, p in nuisances(data, Point(DRONE, {}, start_noise()), ())}
     strengths, precisions = free[OWN + "thrust_scale"]
     assert isinstance(strengths, OfRecordings)
     assert strengths.free == ("0.csv/scale", "1.csv/scale", "2.csv/scale", "3.csv/scale")

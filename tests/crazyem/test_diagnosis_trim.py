@@ -13,14 +13,14 @@ from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Noise, Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import (
-    abstained,
     nuisances,
     refine_base,
     without,
+    without_unobservable,
 )
-from crazyem.diagnosis.fitting.sampling import fast_share, held, of_a_real_drone
+from crazyem.diagnosis.fitting.sampling import fast_share, mean_torque, with_zero_trim
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming.balance import balance_of
 from crazyem.diagnosis.naming.baseline import with_baseline
@@ -60,11 +60,11 @@ def test_a_day_is_free_only_where_the_file_has_a_trim() -> None:
     for vehicle, there in ((DRONE, False), (TRIMMED, True)):
         free = {c.effect for c, _ in nuisances(data, point_of(vehicle), ())}
         assert ({TRIM, "thrust_scale", "velocity_moment"} <= free) is there
-        assert usual_gusts(Point(vehicle, {}, first_guess())) == (
+        assert usual_gusts(Point(vehicle, {}, start_noise())) == (
             1.0 if there else 0.4
         )  # m/s: weather of a drone that flew, air of a room
     stormy = replace(TRIMMED, effects={**TRIMMED.effects, "gusts": {"standard_deviation": 2.0}})
-    assert usual_gusts(Point(stormy, {}, first_guess())) == pytest.approx(4.0)
+    assert usual_gusts(Point(stormy, {}, start_noise())) == pytest.approx(4.0)
 
 
 @pytest.mark.slow
@@ -78,7 +78,7 @@ def test_a_trim_is_free_where_no_centre_of_mass_is_asked_for() -> None:
         sd = np.array(free["center_of_mass"]) ** -0.5
         assert sd[:2] == pytest.approx(0.05 * DRONE.arm[0] if there else 2e-5)
     data = Data(flights)
-    start = nominal(data, Point(DRONE, {}, first_guess())).with_effects(
+    start = nominal(data, Point(DRONE, {}, start_noise())).with_effects(
         {"linear_drag": {"x": 0.01, "y": 0.01, "z": 0.0}}
     )
     found = refine_base(data, start, [drag]).point.effects
@@ -104,20 +104,20 @@ def test_a_trim_is_assumed_where_commands_shake_and_hold_a_steady_torque(white: 
     flights = [replace(flight, inputs=rotor)]
     share = fast_share(flights[0], DRONE)
     assert share == pytest.approx(0.5, abs=0.1) if white else share < 0.15
-    assert of_a_real_drone(flights, DRONE) is DRONE  # whatever shakes: nothing steady is held against
+    assert with_zero_trim(flights, DRONE) is DRONE  # whatever shakes: nothing steady is held against
     twisted = rotor.thrust * np.array([1.1, 0.9, 1.1, 0.9])
     held_against = [replace(flight, inputs=replace(rotor, thrust=twisted))]
-    assert held(held_against[0], DRONE)[2] == pytest.approx(-0.1 * DRONE.torque_per_thrust, rel=0.1)
-    assumed = of_a_real_drone(held_against, DRONE)
+    assert mean_torque(held_against[0], DRONE)[2] == pytest.approx(-0.1 * DRONE.torque_per_thrust, rel=0.1)
+    assumed = with_zero_trim(held_against, DRONE)
     assert (assumed.effects.get(TRIM) == {"x": 0.0, "y": 0.0, "z": 0.0}) is white
-    assert of_a_real_drone(flights, TRIMMED) is TRIMMED
+    assert with_zero_trim(flights, TRIMMED) is TRIMMED
 
 
 @pytest.mark.parametrize("coarse", [False, True])
 def test_without_torques_the_height_of_a_load_is_not_told(coarse: bool) -> None:
     data, point = Data([replace(flight_of(fly(seconds=8.0), DRONE), coarse=coarse)]), point_of(TRIMMED)
     candidates, _ = candidates_for(point, data.signals, measured_speeds=False)
-    left, reasons = abstained(data, point, candidates, {"gusts": "why not"})
+    left, reasons = without_unobservable(data, point, candidates, {"gusts": "why not"})
     assert ("inertia" in reasons) is coarse
     load = [c for c in left if c.effect == "payload"]
     assert [c.free for c in load] == ([] if coarse else [("mass", "x", "y", "z")])
@@ -130,7 +130,7 @@ def test_the_firmware_on_a_pc_shakes_and_is_no_real_drone(shared_recordings) -> 
     vehicle = load_vehicle("cf2")
     flight = flight_of(open_recording(shared_recordings / name), vehicle)
     assert fast_share(flight, vehicle) > 0.3
-    assert of_a_real_drone([flight], vehicle) is vehicle
+    assert with_zero_trim([flight], vehicle) is vehicle
 
 
 # -- symmetry ----------------------------------------------------------------------------------------------------------
@@ -176,7 +176,7 @@ def turned_file(vehicle: Vehicle, polar: NDArray) -> Vehicle:
 def odds(recording: Recording, vehicle: Vehicle) -> NDArray:
     """(4,) nats by which the balance prefers a fault of each rotor to none."""
     data = Data([flight_of(recording, vehicle)])
-    found = explanations([balance_of(data, nominal(data, replace(point_of(vehicle), noise=first_guess())))])
+    found = explanations([balance_of(data, nominal(data, replace(point_of(vehicle), noise=start_noise())))])
     return np.array([found["rotor", r][0] - found["", 0][0] for r in (1, 2, 3, 4)])
 
 

@@ -11,7 +11,7 @@ from closed_loop import DRONE, Hidden, fly
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.workers import MOST, Workers
 from crazyem.errors import UsageError
@@ -91,11 +91,11 @@ def test_a_number_of_threads_that_makes_no_sense(jobs):
 
 def test_what_is_done_to_a_twin_leaves_the_data_as_it_is():
     data = Data([flight_of(fly(seconds=5.0), DRONE)])
-    point = Point(DRONE, {}, first_guess())
+    point = Point(DRONE, {}, start_noise())
     data.settle(point)
     path = data.models[0].path
     kept = path.copy()
-    other = replace(point, noise=first_guess()).with_effects({"payload": {"mass": 0.01, "x": 0.0, "y": 0.0, "z": 0.0}})
+    other = replace(point, noise=start_noise()).with_effects({"payload": {"mass": 0.01, "x": 0.0, "y": 0.0, "z": 0.0}})
     twin = data.twin()
     twin.settle(other)
     assert data.models[0].path is path

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import OWN, Column, Model, Point, Swept
-from crazyem.diagnosis.fitting.noise import Informed, coloured, fit_noise, without_slight
+from crazyem.diagnosis.fitting.noise import CurvatureCache, coloured, fit_noise, without_negligible
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.settings import FITTING
 from crazyem.diagnosis.workers import Workers
@@ -53,7 +53,7 @@ class Data:
     def __init__(self, flights: Sequence[Flight], workers: Workers | None = None) -> None:
         self.models = [Model(f) for f in flights]
         self.workers = workers or Workers(1)
-        self.informed = Informed()
+        self.curvatures = CurvatureCache()
         self.constrained: frozenset[str] = frozenset()  # nuisances that are not free here
         self.own: Point | None = None  # of held-out flights: their noise and the start values of their nuisances
 
@@ -67,7 +67,7 @@ class Data:
         """An independent copy: the same flights with the paths of the last pass."""
         twin = Data((), self.workers)
         twin.models = [m.twin() for m in self.models]
-        twin.informed = self.informed.copy()
+        twin.curvatures = self.curvatures.copy()
         twin.constrained, twin.own = self.constrained, self.own
         return twin
 
@@ -123,9 +123,9 @@ class Data:
     def converge(self, point: Point) -> None:
         """Repeat passes until the physics is evaluated at the states of the filter.
 
-        Only with an effect that is `strongly_shown`; otherwise one pass is enough.
+        Only with an effect that is `has_large_offset`; otherwise one pass is enough.
         """
-        if not any(strongly_shown(name, values) for name, values in point.effects.items()):
+        if not any(has_large_offset(name, values) for name, values in point.effects.items()):
             return
         before = self.loglik(point)
         for _ in range(FITTING.passes):
@@ -140,7 +140,7 @@ class Data:
         for model in self.models:
             acceleration, _ = model.accelerations(point)
             parts.append((model.flight, acceleration, model.offsets(point, acceleration)))
-        found = fit_noise(parts, point.noise, near=near, workers=self.workers, informed=self.informed)
+        found = fit_noise(parts, point.noise, near=near, workers=self.workers, curvatures=self.curvatures)
         return replace(point, noise=found)
 
     def leave_out_wild(self, point: Point) -> int:
@@ -183,7 +183,7 @@ class Data:
         return Gram(np.concatenate(score), np.concatenate(information), np.concatenate(flight)), loglik
 
 
-def strongly_shown(name: str, values: Mapping[str, Any]) -> bool:
+def has_large_offset(name: str, values: Mapping[str, Any]) -> bool:
     """Whether an effect makes measurements differ so much from the state that one pass is not enough."""
     if name.startswith(OWN) or CATALOGUE[name].measured is None:
         return False
@@ -197,16 +197,16 @@ def nominal(data: Data, point: Point) -> Point:
     data.settle(point)
     fitted = data.fit_noise(point)
     fitted = data.fit_noise(replace(fitted, noise=coloured(fitted.noise, data.flights)), near=True)
-    fitted = replace(fitted, noise=without_slight(fitted.noise, data.flights))
+    fitted = replace(fitted, noise=without_negligible(fitted.noise, data.flights))
     if data.leave_out_wild(fitted):
         data.settle(fitted)
         fitted = data.fit_noise(fitted)
-    fitted = remembering(data, fitted)
+    fitted = with_torque_memory(data, fitted)
     data.settle(fitted)
     return fitted
 
 
-def remembering(data: Data, point: Point) -> Point:
+def with_torque_memory(data: Data, point: Point) -> Point:
     """The point with disturbing torques that have a memory, where the likelihood gains by them.
 
     A command sampled at 100 Hz stands for five or ten commands that the rotors got. The commands between the samples
@@ -228,14 +228,14 @@ def remembering(data: Data, point: Point) -> Point:
     return best
 
 
-def remembering_anew(data: Data, point: Point) -> Point:
-    """`remembering` for a model with a newly found effect, whose torques were part of the noise."""
+def with_torque_memory_refit(data: Data, point: Point) -> Point:
+    """`with_torque_memory` for a model with a newly found effect, whose torques were part of the noise."""
     if not point.noise.disturbance[3:].any():
-        return remembering(data, point)
+        return with_torque_memory(data, point)
     forces = np.concatenate([point.noise.disturbance[:3], np.zeros(3)])
     white = data.fit_noise(replace(point, noise=replace(point.noise, disturbance=forces)), near=True)
     data.settle(white)
-    chosen = remembering(data, white)
+    chosen = with_torque_memory(data, white)
     data.settle(chosen)
     return chosen
 
@@ -273,7 +273,7 @@ def local_precision(away: NDArray, precision: NDArray, freedom: NDArray) -> NDAr
     return np.where(normal, precision, precision * (nu + 1.0) / (nu + precision * np.square(away)))
 
 
-def held_near(
+def nuisance_bounds(
     low: NDArray, high: NDArray, away: NDArray, precision: NDArray, freedom: NDArray | None = None
 ) -> tuple[NDArray, NDArray]:
     """Bounds of change. A parameter with a normal prior stays within `FITTING.max_deviation` standard deviations: a
@@ -284,7 +284,7 @@ def held_near(
     return np.maximum(low, np.minimum(-reach - away, 0.0)), np.minimum(high, np.maximum(reach - away, 0.0))
 
 
-def moved(point: Point, candidates: Sequence[Candidate], change: NDArray) -> Point:
+def with_change(point: Point, candidates: Sequence[Candidate], change: NDArray) -> Point:
     """The point with the free parameters changed."""
     changes: dict[str, dict[str, Any]] = {}
     at = 0
@@ -335,12 +335,12 @@ def refine(
     if not np.isfinite(value) or not np.isfinite(gram.information).all():
         raise DivergedError("the vehicle's model leaves the range of numbers on this flight: is it this drone's?")
     for turn in range(rounds if free else 0):
-        low, high = held_near(*bounds_of(free, point), away(point), weight, freedom)
+        low, high = nuisance_bounds(*bounds_of(free, point), away(point), weight, freedom)
         local = local_precision(away(point), weight, freedom)
         best = gram.solve(range(gram.size), low=low, high=high, precision=local, prior=-away(point))
         before = value
         for k in range(FITTING.tries if best.gain > FITTING.min_step_gain else 0):
-            there = moved(point, free, best.theta / 3**k)
+            there = with_change(point, free, best.theta / 3**k)
             found, slopes = look(there)
             if found > value - 1e-6:
                 point, value, gram = there, found, slopes

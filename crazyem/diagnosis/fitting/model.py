@@ -65,7 +65,7 @@ class Column:
     showing: NDArray | None = None
 
 
-def corrected(swept: Swept, flight: Flight) -> tuple[NDArray, NDArray, NDArray]:
+def filter_corrections(swept: Swept, flight: Flight) -> tuple[NDArray, NDArray, NDArray]:
     """Corrections of a pass of the filter to its model by steps: changes (n, 6) of velocity [m/s] and body rate
     [rad/s], body axes; lengths (n,) of the steps [s]; whether they are known (n,). Unknown ones are 0."""
     step = np.diff(flight.time, prepend=flight.time[0])
@@ -75,26 +75,25 @@ def corrected(swept: Swept, flight: Flight) -> tuple[NDArray, NDArray, NDArray]:
     return impulse, np.where(known, step, 0.0), known
 
 
-def seen_force(acceleration: NDArray, impulse: NDArray, step: NDArray, known: NDArray) -> NDArray:
-    """(n, 3) m/s^2, specific force over each step: that of the model plus the correction of the filter (`corrected`);
-    NaN: not known."""
+def observed_force(acceleration: NDArray, impulse: NDArray, step: NDArray, known: NDArray) -> NDArray:
+    """(n, 3) m/s^2, specific force over each step: of the model, plus `filter_corrections`; NaN: not known."""
     with np.errstate(invalid="ignore", divide="ignore"):
         seen: NDArray = np.where(known[:, None], acceleration[:, :3] + impulse[:, :3] / step[:, None], np.nan)
     return seen
 
 
-def unrest(noise: Noise) -> NDArray:
+def force_noise(noise: Noise) -> NDArray:
     """(3,) m/s^2 sqrt(s), intensity of the random specific force, white and with memory."""
     memory = np.broadcast_to(np.asarray(noise.memory, float), (6,))[:3]
     found: NDArray = np.sqrt(np.square(noise.impulse[:3]) + 2.0 * memory * np.square(noise.disturbance[:3]))
     return found
 
 
-def lacking(impulse: NDArray, step: NDArray, known: NDArray) -> NDArray:
+def missing_acceleration(impulse: NDArray, step: NDArray, known: NDArray) -> NDArray:
     """(n, 6) specific force m/s^2 and angular acceleration rad/s^2, body axes, that a model lacks along a flight.
 
     The mean over the last `NOISE.averaging` of disturbances with memory and of corrections by measurements (both in
-    `corrected`). The filter sees faster changes too late; they would look like a gyro that is early.
+    `filter_corrections`). The filter sees faster changes too late; they would look like a gyro that is early.
     """
     forget = [1.0, -np.exp(-float(np.median(step[known])) / NOISE.averaging)] if known.any() else [1.0, 0.0]
     total, span = (lfilter([1.0], forget, v, axis=0) for v in (impulse, step[:, None]))
@@ -131,15 +130,15 @@ class Model:
 
     flight: Flight
     path: NDArray | None = None  # (n, 19) in the middle of each step
-    shown: NDArray | None = None  # (n, 19) filtered, at the rows
-    moved: NDArray | None = None  # (n, 6) accelerations along that path: of the model, plus `lacking`
-    seen: NDArray | None = None  # (n, 3) specific force over each step of that path (`seen_force`)
+    rows_path: NDArray | None = None  # (n, 19) filtered, at the rows
+    observed_acceleration: NDArray | None = None  # (n, 6) along that path: of the model, plus `missing_acceleration`
+    observed_force: NDArray | None = None  # (n, 3) specific force over each step of that path (`observed_force`)
     _thrusts: dict[str, tuple[NDArray, NDArray]] = field(default_factory=dict)
-    _there: Situation | None = None  # along the path
-    _as_shown: Situation | None = None  # at the rows
-    _offsets: dict[str, NDArray] = field(default_factory=dict)  # of single effects, at `_as_shown`
-    _strays: dict[str, bool] = field(default_factory=dict)  # effect -> `diverges`; shared by twins
-    _felt_alone: bool | None = None
+    _path_situation: Situation | None = None  # along the path
+    _row_situation: Situation | None = None  # at the rows
+    _offsets: dict[str, NDArray] = field(default_factory=dict)  # of single effects, at `_row_situation`
+    _diverging: dict[str, bool] = field(default_factory=dict)  # effect -> `diverges`; shared by twins
+    _force_needed: bool | None = None
     _vibration: NDArray | None = None
 
     def twin(self) -> "Model":
@@ -149,7 +148,7 @@ class Model:
     def thrusts(self, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, NDArray]:
         """Thrusts after the lag; stored, because most columns do not change the inputs of the rotors."""
         effects = of_recording(effects, self.flight.name)
-        before = {n: effects[n] for n in effects if _before_rotors(n)}
+        before = {n: effects[n] for n in effects if _changes_input(n)}
         key = f"{vehicle!r} {before!r}"
         found = self._thrusts.get(key)
         if found is None:
@@ -163,20 +162,22 @@ class Model:
         effects = of_recording(point.effects if effects is None else effects, self.flight.name)
         path = initial_path(self.flight) if self.path is None else self.path
         thrusts = self.thrusts(point.vehicle, effects)
-        if self._there is None:
-            self._there = situation_of(self.flight, path, point.vehicle, thrusts)
-        situation = with_rotors(self._there, point.vehicle, thrusts)
+        if self._path_situation is None:
+            self._path_situation = situation_of(self.flight, path, point.vehicle, thrusts)
+        situation = with_rotors(self._path_situation, point.vehicle, thrusts)
         # only if the effect diverges: in other flights the path is enough, and `seen` contains the drift of attitudes
-        if self.seen is not None and any(_ties(name) and self.diverges(name, point.vehicle) for name in effects):
-            situation = replace(situation, seen=self.seen, unrest=unrest(point.noise))
+        if self.observed_force is not None and any(
+            _has_swing(name) and self.diverges(name, point.vehicle) for name in effects
+        ):
+            situation = replace(situation, seen=self.observed_force, unrest=force_noise(point.noise))
         moved = motion(situation, vehicle=point.vehicle, effects=effects)
         return np.concatenate([moved.specific_force, moved.angular_acceleration], axis=1), situation
 
     def diverges(self, name: str, vehicle: Vehicle) -> bool:
         """Whether the flight drives the state of an effect into chaos (`divergence.diverges`); stored."""
-        if name not in self._strays:
-            self._strays[name] = diverges(self.flight, vehicle, name)
-        return self._strays[name]
+        if name not in self._diverging:
+            self._diverging[name] = diverges(self.flight, vehicle, name)
+        return self._diverging[name]
 
     def offsets(self, point: Point, accelerations: NDArray, effects: Effects | None = None) -> NDArray:
         """(n, 12) offsets of the measurements from the state, evaluated at the filtered states.
@@ -185,7 +186,7 @@ class Model:
         mass shifted by 0.7 mm makes 10 rad/s^2; with a lag of 1 ms this would be a gyro bias of 10 mrad/s.
         """
         effects = of_recording(point.effects if effects is None else effects, self.flight.name)
-        showing = [name for name in CATALOGUE if name in effects and _shows(name)]
+        showing = [name for name in CATALOGUE if name in effects and _changes_measurement(name)]
         offset = np.zeros((self.flight.time.size, 12))
         if not showing:
             return offset
@@ -197,24 +198,24 @@ class Model:
                 offset = offset + measured(turned, vehicle=point.vehicle, effects=only).state
                 continue
             key = f"{name} {effects[name]!r}"
-            if key not in self._offsets or self.moved is None:
+            if key not in self._offsets or self.observed_acceleration is None:
                 self._offsets[key] = measured(situation, vehicle=point.vehicle, effects=only).state
             offset += self._offsets[key]
         return offset
 
     def _situation_shown(self, point: Point, accelerations: NDArray) -> Situation:
         """The situation at the rows; stored after the first pass, which estimates the true accelerations."""
-        if self._as_shown is not None and self.moved is not None:
-            return self._as_shown
-        path = initial_path(self.flight) if self.shown is None else self.shown
+        if self._row_situation is not None and self.observed_acceleration is not None:
+            return self._row_situation
+        path = initial_path(self.flight) if self.rows_path is None else self.rows_path
         model_force = accelerations[:, :3]
-        accelerations = accelerations if self.moved is None else self.moved
+        accelerations = accelerations if self.observed_acceleration is None else self.observed_acceleration
         situation = situation_of(self.flight, path, point.vehicle, self.thrusts(point.vehicle, {}))
-        self._as_shown = replace(
+        self._row_situation = replace(
             situation, specific_force=accelerations[:, :3], angular_acceleration=accelerations[:, 3:],
             integrated=integrated_path(situation, accelerations), model_force=model_force,
         )  # fmt: skip
-        return self._as_shown
+        return self._row_situation
 
     def sweep(
         self, point: Point, columns: Sequence[Column] = (), *, passes: int = 1, workers: Workers | None = None
@@ -238,22 +239,22 @@ class Model:
             swept = self._with_specific_force(swept, acceleration, acting)
         if order is not None:
             swept = _in_order(swept, order)
-        self._there = self._as_shown = None
+        self._path_situation = self._row_situation = None
         self._offsets = {}
         if not np.isfinite(swept.filtered).all():  # the next model must not start from such states
-            self.path = self.shown = self.moved = self.seen = None
+            self.path = self.rows_path = self.observed_acceleration = self.observed_force = None
             return swept
         self.path = causal_middle(swept.filtered, swept.predicted, flight.starts)
-        self.shown = relaxed(swept.filtered, self.shown, offset)
-        found = corrected(swept, flight)
-        self.moved = acceleration + lacking(*found)
-        self.seen = seen_force(acceleration, *found)
+        self.rows_path = under_relaxed(swept.filtered, self.rows_path, offset)
+        found = filter_corrections(swept, flight)
+        self.observed_acceleration = acceleration + missing_acceleration(*found)
+        self.observed_force = observed_force(acceleration, *found)
         return swept
 
     def _needs_specific_force(self) -> bool:
-        if self._felt_alone is None:
-            self._felt_alone = specific_force.is_needed(self.flight)
-        return self._felt_alone
+        if self._force_needed is None:
+            self._force_needed = specific_force.is_needed(self.flight)
+        return self._force_needed
 
     def _with_specific_force(self, swept: Swept, acceleration: NDArray, acting: NDArray) -> Swept:
         """The pass with the evidence of the accelerometer (`specific_force.py`) added."""
@@ -316,11 +317,11 @@ class Model:
         minus = here if column.minus is None else of_recording(column.minus, self.flight.name)
         changed = [n for n in {**minus, **plus} if plus.get(n) != minus.get(n)]
         d_acting = d_showing = None
-        if any(not _shows(name) for name in changed):
+        if any(not _changes_measurement(name) for name in changed):
             up = self.accelerations(point, plus)[0]
             down = acceleration if column.minus is None else self.accelerations(point, column.minus)[0]
             d_acting = (up - down) / column.width
-        if any(_shows(name) for name in changed):
+        if any(_changes_measurement(name) for name in changed):
             up = self.offsets(point, acceleration, plus)
             down = offset if column.minus is None else self.offsets(point, acceleration, column.minus)
             d_showing = (up - down) / column.width
@@ -343,7 +344,7 @@ class Model:
         return shown if shown.any() else None
 
 
-def relaxed(filtered: NDArray, before: NDArray | None, offset: NDArray) -> NDArray:
+def under_relaxed(filtered: NDArray, before: NDArray | None, offset: NDArray) -> NDArray:
     """(n, 19) states for the next offsets of measurements, from the states of this pass and of the last one.
 
     If a measured velocity is s times too large, the offset follows from the velocity of the last pass. An error of this
@@ -376,14 +377,14 @@ def _in_order(swept: Swept, order: NDArray) -> Swept:
     return replace(swept, score=ordered, information=products)
 
 
-def _before_rotors(name: str) -> bool:
+def _changes_input(name: str) -> bool:
     effect = CATALOGUE[name]
     return effect.commanded is not None or effect.timing is not None or effect.speed is not None
 
 
-def _ties(name: str) -> bool:
+def _has_swing(name: str) -> bool:
     return CATALOGUE[name].tied is not None
 
 
-def _shows(name: str) -> bool:
+def _changes_measurement(name: str) -> bool:
     return CATALOGUE[name].measured is not None

@@ -60,7 +60,7 @@ def coloured(noise: Noise, flights: Sequence[Flight]) -> Noise:
     return replace(noise, coloured=np.where(lasting, noise.measurement, 0.0), recall=RECALL.copy())
 
 
-def without_slight(noise: Noise, flights: Sequence[Flight]) -> Noise:
+def without_negligible(noise: Noise, flights: Sequence[Flight]) -> Noise:
     """The noise without coloured errors that are negligible at all frequencies: each costs time in every pass."""
     periods = np.array([_period(flights, c) for c in FIRST])
     density = noise.coloured * np.sqrt(1.0 + 2.0 * noise.recall / periods)
@@ -84,20 +84,20 @@ def sample_rows(flight: Flight, *, rows: int = NOISE.rows, stretch: int = NOISE.
     return keep
 
 
-def first_guess() -> Noise:
+def start_noise() -> Noise:
     """Start values of scoring."""
     return Noise(np.array([0.3, 0.3, 0.5, 5.0, 5.0, 5.0]), np.array([3e-3, 3e-2, 1e-2, 3e-2]))
 
 
 @dataclass
-class Informed:
+class CurvatureCache:
     """Known curvatures (k, k) by the noise scales, for sets of flights and of free scales."""
 
     known: dict[tuple[object, ...], NDArray] = field(default_factory=dict)
 
-    def copy(self) -> "Informed":
+    def copy(self) -> "CurvatureCache":
         """An independent copy."""
-        return Informed(dict(self.known))
+        return CurvatureCache(dict(self.known))
 
 
 Part = tuple[Flight, NDArray, NDArray]  # a flight, its accelerations (n, 6) and offsets (n, 12)
@@ -110,26 +110,26 @@ def fit_noise(
     near: bool = False,
     tolerance: float = 0.2,
     workers: Workers | None = None,
-    informed: Informed | None = None,
+    curvatures: CurvatureCache | None = None,
 ) -> Noise:
     """Noise scales of highest posterior density, for given accelerations (n, 6) and offsets (n, 12) of each flight.
 
     Scales of quantities that are not measured stay. Disturbances are fitted where they start above 0. Unless the start
     is `near`, a rough fit to few rows comes first.
     """
-    workers, informed = workers or Workers(1), informed or Informed()
+    workers, curvatures = workers or Workers(1), curvatures or CurvatureCache()
     if not near and any(f.time.size > NOISE.rough_rows for f, _, _ in parts):
         few = [
             (f.rows(k), a[k], o[k])
             for f, a, o in parts
             for k in (sample_rows(f, rows=NOISE.rough_rows, stretch=NOISE.rough_stretch),)
         ]
-        start = _scored(few, start, 5 * tolerance, workers, Informed())
+        start = _scored(few, start, 5 * tolerance, workers, CurvatureCache())
     chosen = [(f.rows(keep), a[keep], o[keep]) for f, a, o in parts for keep in (sample_rows(f, rows=NOISE.rows),)]
-    return _scored(chosen, start, tolerance, workers, informed)
+    return _scored(chosen, start, tolerance, workers, curvatures)
 
 
-def _scored(chosen: list[Part], start: Noise, tolerance: float, workers: Workers, informed: Informed) -> Noise:
+def _scored(chosen: list[Part], start: Noise, tolerance: float, workers: Workers, curvatures: CurvatureCache) -> Noise:
     measured = np.zeros(4, bool)
     for flight, _, _ in chosen:
         measured |= np.array([np.isfinite(flight.y[:, c]).any() for c in FIRST])
@@ -153,11 +153,11 @@ def _scored(chosen: list[Part], start: Noise, tolerance: float, workers: Workers
 
     value, score, swept = look(logs)
     for _ in range(NOISE.max_steps):
-        fresh = key not in informed.known
+        fresh = key not in curvatures.known
         if fresh:
             information = _information(chosen, swept, logs, memory, index, workers)
-            informed.known[key] = information + np.diag(weight)
-        curvature = informed.known[key]
+            curvatures.known[key] = information + np.diag(weight)
+        curvature = curvatures.known[key]
         step = np.clip(np.linalg.solve(curvature, score), -NOISE.max_log_step, NOISE.max_log_step)
         for _ in range(5):
             there = logs.copy()
@@ -169,10 +169,10 @@ def _scored(chosen: list[Part], start: Noise, tolerance: float, workers: Workers
         else:
             if fresh:
                 break
-            del informed.known[key]
+            del curvatures.known[key]
             continue
         gain, way = found - value, there[index] - logs[index]
-        informed.known[key] = _learnt(curvature, way, score - slope)
+        curvatures.known[key] = _bfgs_update(curvature, way, score - slope)
         promised = 0.5 * float(score @ way)
         logs, value, score, swept = there, found, slope, passes
         if max(gain, promised) < tolerance:
@@ -180,7 +180,7 @@ def _scored(chosen: list[Part], start: Noise, tolerance: float, workers: Workers
     return noise_of(logs, memory)
 
 
-def _learnt(curvature: NDArray, way: NDArray, change: NDArray) -> NDArray:
+def _bfgs_update(curvature: NDArray, way: NDArray, change: NDArray) -> NDArray:
     """The curvature (k, k) after a BFGS update: along the step `way` (k,), the score fell by `change` (k,)."""
     along, before = float(way @ change), curvature @ way
     if along <= 1e-3 * float(way @ before):

@@ -10,7 +10,15 @@ from scipy import stats
 from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate, of_recordings
 from crazyem.diagnosis.fitting.conditions import conditions_of
 from crazyem.diagnosis.fitting.days import trim_known
-from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, bounds_of, refine, remembering, remembering_anew
+from crazyem.diagnosis.fitting.fit import (
+    Data,
+    DivergedError,
+    Fitted,
+    bounds_of,
+    refine,
+    with_torque_memory,
+    with_torque_memory_refit,
+)
 from crazyem.diagnosis.fitting.gram import Solution, used
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.flights.flight import Flight
@@ -53,7 +61,7 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
     return [(c, p) for c, p in found if c.effect not in taken]
 
 
-def differing(flights: Sequence[Flight], kept_apart: Sequence[Flight], vehicle: Vehicle) -> list[list[Flight]]:
+def with_thrust_scales(flights: Sequence[Flight], kept_apart: Sequence[Flight], vehicle: Vehicle) -> list[list[Flight]]:
     """The flights, each with a thrust scale of its own if there are enough of them (`FITTING.min_thrust_flights`).
 
     A vehicle file with a trim already has such a free thrust. So does a voltage from the start of the flight
@@ -64,7 +72,7 @@ def differing(flights: Sequence[Flight], kept_apart: Sequence[Flight], vehicle: 
     return [[replace(f, differs=own) for f in part] for part in (flights, kept_apart)]
 
 
-def unlike_a_body(point: Point, accepted: Sequence[Candidate]) -> bool:
+def is_nonphysical(point: Point, accepted: Sequence[Candidate]) -> bool:
     """Whether an inertia, a lack of torque or a damping in the model is larger than a drone of this mass and size can
     have.
 
@@ -75,13 +83,13 @@ def unlike_a_body(point: Point, accepted: Sequence[Candidate]) -> bool:
     return any(point.vehicle.arm) and any(test(values, point.vehicle) for test, values in tests if test)
 
 
-def abstained(
+def without_unobservable(
     data: Data, point: Point, candidates: Sequence[Candidate], left_out: dict[str, str]
 ) -> tuple[list[Candidate], dict[str, str]]:
     """The candidates without those that such recordings cannot show, and `left_out` with the reasons of these."""
     gone = {}
     if TRIM in point.vehicle.effects:
-        gone = {c.effect: TRIM_REASON for c in candidates if _only_shifts(CATALOGUE[c.effect])}
+        gone = {c.effect: TRIM_REASON for c in candidates if _shifts_mass_only(CATALOGUE[c.effect])}
     if all(f.levelled for f in data.flights):
         gone |= {c.effect: LEVEL_REASON for c in candidates if CATALOGUE[c.effect].needs_voltage}
     if data.coarse:
@@ -90,7 +98,7 @@ def abstained(
     return [c for c in candidates if c.effect not in gone], {**left_out, **gone}
 
 
-def _only_shifts(effect: Effect) -> bool:
+def _shifts_mass_only(effect: Effect) -> bool:
     """Whether an effect moves the centre of mass and does not change the mass."""
     return effect.shifts_centre and not effect.lifts
 
@@ -122,7 +130,7 @@ def with_trim_noise(data: Data, point: Point) -> Point:
     for _ in range(2):  # in the first turn, the noise still explains steady torques
         found = refine(data, found, free, nuisances=rest, rounds=4).point
         white = replace(found.noise, disturbance=np.concatenate([found.noise.disturbance[:3], np.zeros(3)]))
-        found = remembering(data, data.fit_noise(replace(found, noise=white)))
+        found = with_torque_memory(data, data.fit_noise(replace(found, noise=white)))
     return replace(point, noise=found.noise)
 
 
@@ -141,7 +149,7 @@ def solved(fitted: Fitted, *, wide: bool = False) -> tuple[Solution, float]:
     return solution, used(information, information + np.diag(precision))
 
 
-def by_gain(point: Point, gain: float, count: int, blocks: int, p_value: float) -> float:
+def p_value_by_gain(point: Point, gain: float, count: int, blocks: int, p_value: float) -> float:
     """The p-value of `count` parameters; with a trim in the file, from `gain`, nats over their own dispersion.
 
     With a trim there are some 20 nuisances, more than blocks in a short flight. Then the scatter of the scores of
@@ -152,7 +160,7 @@ def by_gain(point: Point, gain: float, count: int, blocks: int, p_value: float) 
     return float(stats.f.sf(2.0 * max(gain, 0.0) / count, count, max(blocks - 1, 1)))
 
 
-def usual_named(candidate: Candidate) -> bool:
+def can_be_finding(candidate: Candidate) -> bool:
     """Whether an effect can be a finding although it is a nuisance."""
     return candidate.effect in CATALOGUE and CATALOGUE[candidate.effect].prior.usual_named
 
@@ -174,7 +182,7 @@ def systematic_sd(data: Data, point: Point) -> dict[tuple[str, str], float]:
         (c.effect, name): precision**-0.5
         for c, precisions in nuisances(data, point, ())
         for name, precision in zip(c.free, precisions, strict=True)
-        if not usual_named(c)
+        if not can_be_finding(c)
     }
     known = {(e.name, n): sd for e in CATALOGUE.values() for n, sd in e.prior.systematic.items()}
     for name, here in point.effects.items():
@@ -185,7 +193,7 @@ def systematic_sd(data: Data, point: Point) -> dict[tuple[str, str], float]:
     return {**known, **free}
 
 
-def by_a_wrong_lag(data: Data, fitted: Fitted) -> dict[tuple[str, str], float]:
+def error_by_lag(data: Data, fitted: Fitted) -> dict[tuple[str, str], float]:
     """(effect, parameter) -> error that an error `FITTING.lag_error` of the rotor lag causes.
 
     For effects with twins (`Effect.twins`), if the lag is a nuisance.
@@ -214,10 +222,10 @@ def with_nuisances(point: Point, free: Nuisances) -> Point:
     return point
 
 
-def on_held_out(held_out: Data, point: Point, accepted: Sequence[Candidate], *, noise: bool = False) -> Fitted:
+def held_out_fit(held_out: Data, point: Point, accepted: Sequence[Candidate], *, noise: bool = False) -> Fitted:
     """The model on held-out flights: with its effects, and with nuisances fitted to these flights.
 
-    The noise scales are those of `held_out.own` (`as_held_out`), if known; with `noise`, they are fitted. An accepted
+    The noise scales are those of `held_out.own` (`held_out_twin`), if known; with `noise`, they are fitted. An accepted
     effect that is also a nuisance is free about its fitted value. Otherwise a model with fixed inertias would be
     compared with a torque scale beside free inertias.
     """
@@ -231,7 +239,7 @@ def on_held_out(held_out: Data, point: Point, accepted: Sequence[Candidate], *, 
     return refine(held_out, start, (), nuisances=free, about=bare, rounds=2, noise=noise)
 
 
-def as_held_out(held_out: Data, point: Point, accepted: Sequence[Candidate]) -> Data:
+def held_out_twin(held_out: Data, point: Point, accepted: Sequence[Candidate]) -> Data:
     """A twin of held-out flights with its own noise scales and nuisances, fitted under this model.
 
     Noise belongs to a recording: between slow and fast flights, it makes thousands of nats. All models that are
@@ -241,13 +249,13 @@ def as_held_out(held_out: Data, point: Point, accepted: Sequence[Candidate]) -> 
     """
     twin = held_out.twin()
     twin.own = None
-    there = on_held_out(twin, point, accepted, noise=TRIM not in point.vehicle.effects).point
+    there = held_out_fit(twin, point, accepted, noise=TRIM not in point.vehicle.effects).point
     gone = {c.effect for c in accepted}
     twin.own = replace(there, effects={n: v for n, v in there.effects.items() if n not in gone})
     return twin
 
 
-def _let_go(point: Point, accepted: Sequence[Candidate], free: Nuisances) -> Point:
+def _reset_conditional(point: Point, accepted: Sequence[Candidate], free: Nuisances) -> Point:
     """The point with effects that are not free in this model (`Prior.conditional`) reset to the vehicle file.
 
     Otherwise a value of an earlier fit would stay in the model unreported, and would bias other effects.
@@ -264,11 +272,11 @@ def refine_base(
     """`refine` with the nuisances; with a trim, the noise scales stay (see `with_trim_noise`)."""
     noise = noise and TRIM not in point.vehicle.effects
     free = nuisances(data, point, accepted)
-    point = _let_go(point, accepted, free)
+    point = _reset_conditional(point, accepted, free)
     return refine(data, with_nuisances(point, free), accepted, nuisances=free, rounds=rounds, noise=noise)
 
 
-def refine_anew(data: Data, point: Point, accepted: Sequence[Candidate], *, rounds: int = 5) -> Fitted:
+def refine_with_memory(data: Data, point: Point, accepted: Sequence[Candidate], *, rounds: int = 5) -> Fitted:
     """`refine_base`, then again with a new choice of the memory of disturbing torques; the better of both.
 
     The memory was chosen under a model without the effects and nuisances. If it is wrong, an effect such as a torque
@@ -276,7 +284,7 @@ def refine_anew(data: Data, point: Point, accepted: Sequence[Candidate], *, roun
     """
     once = refine_base(data, point, accepted, rounds=rounds)
     try:
-        again = refine_base(data, remembering_anew(data, once.point), accepted, rounds=rounds)
+        again = refine_base(data, with_torque_memory_refit(data, once.point), accepted, rounds=rounds)
     except DivergedError:  # then the first fit stays
         again = once
     if again.loglik > once.loglik:

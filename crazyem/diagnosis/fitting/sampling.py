@@ -16,7 +16,7 @@ from crazyem.physics.rotors import wrench
 from crazyem.vehicle import Vehicle
 
 
-def shaken_commands(flights: Sequence[Flight], vehicle: Vehicle) -> bool:
+def coarse_commands(flights: Sequence[Flight], vehicle: Vehicle) -> bool:
     """Whether the commands of most flights are faster than their sampling (see `FITTING.coarse_share`)."""
     shares = [fast_share(f, vehicle) for f in flights if not f.inputs.measured]
     return bool(shares) and float(np.median(shares)) > FITTING.coarse_share
@@ -42,21 +42,21 @@ def interval(flight: Flight) -> float:
     return float(max(np.median(np.diff(flight.inputs.time)), np.median(np.diff(flight.time))))
 
 
-def of_a_real_drone(flights: Sequence[Flight], vehicle: Vehicle) -> Vehicle:
+def with_zero_trim(flights: Sequence[Flight], vehicle: Vehicle) -> Vehicle:
     """The vehicle with a trim of 0, if its file has no trim, its commands shake like those of a real drone, and they
     have a steady torque.
 
     Such commands show little but their mean. The trim lets this mean differ as it does from drone to drone and from
     day to day. Otherwise the mean looks like a weak rotor, a load or a wind.
     """
-    if TRIM in vehicle.effects or not shaken_commands(flights, vehicle):
+    if TRIM in vehicle.effects or not coarse_commands(flights, vehicle):
         return vehicle
-    if not any(np.any(np.abs(held(f, vehicle)) > TRIM_SD) for f in flights):
+    if not any(np.any(np.abs(mean_torque(f, vehicle)) > TRIM_SD) for f in flights):
         return vehicle
     return replace(vehicle, effects={**vehicle.effects, TRIM: dict.fromkeys("xyz", 0.0)})
 
 
-def held(flight: Flight, vehicle: Vehicle) -> NDArray:
+def mean_torque(flight: Flight, vehicle: Vehicle) -> NDArray:
     """(3,) mean torque of the commands in the air over their mean thrust [m], body axes; it balances the trim."""
     inside = (flight.inputs.time > flight.time[0]) & (flight.inputs.time < flight.time[-1])
     mean = wrench(flight.inputs.thrust[inside], arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust).mean(0)

@@ -68,8 +68,8 @@ def align(recording: Recording, thrust_time: NDArray, thrust: NDArray, flight: A
     """
     if flight is None or not flight.flown or "body_rate" not in recording.signals or thrust_time.size < 100:
         return None
-    when, rate = _fresh(*ordered(recording.signals["body_rate"]))
-    thrust_time, thrust = _fresh(thrust_time, thrust)
+    when, rate = _without_repeats(*ordered(recording.signals["body_rate"]))
+    thrust_time, thrust = _without_repeats(thrust_time, thrust)
     if when.size < 100 or thrust_time.size < 100:
         return None
     time = np.arange(max(when[0], thrust_time[0]), min(when[-1], thrust_time[-1]), CLOCKS.grid)
@@ -98,13 +98,13 @@ def align(recording: Recording, thrust_time: NDArray, thrust: NDArray, flight: A
     return _accepted(delays, sums, time[index], block)
 
 
-def _fresh(time: NDArray, value: NDArray) -> tuple[NDArray, NDArray]:
+def _without_repeats(time: NDArray, value: NDArray) -> tuple[NDArray, NDArray]:
     """The samples without rows that repeat the row before: a held value is no new sample."""
     new = np.concatenate([[True], np.any(np.diff(value, axis=0) != 0, axis=1)]) if time.size else np.ones(0, bool)
     return time[new], value[new]
 
 
-def _unhit(delays: NDArray, sums: NDArray) -> NDArray:
+def _without_collisions(delays: NDArray, sums: NDArray) -> NDArray:
     """(2, b, delays, k, k): the sums of blocks without a collision."""
     total = sums.sum(1)
     delay, _ = band.delay_of(delays, total)
@@ -125,7 +125,7 @@ def _accepted(delays: NDArray, sums: NDArray, time: NDArray, block: NDArray) -> 
     count = sums.shape[1]
     if count < CLOCKS.min_blocks:
         return None
-    unhit = _unhit(delays, sums)
+    unhit = _without_collisions(delays, sums)
     total = unhit.sum(1)
     delay, explained = band.delay_of(delays, total)
     roll, pitch = (band.peak(delays, band.explained_share(total[i])) for i in range(2))
@@ -142,7 +142,7 @@ def _accepted(delays: NDArray, sums: NDArray, time: NDArray, block: NDArray) -> 
         if b not in looked_at:
             running[b] = running[b - 1]
             continue
-        until = _unhit(delays, sums[:, : b + 1])
+        until = _without_collisions(delays, sums[:, : b + 1])
         before = until.sum(1)
         found, _ = band.delay_of(delays, before)
         error = band.standard_error(delays, until, before)

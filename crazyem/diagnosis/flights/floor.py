@@ -13,7 +13,7 @@ from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.settings import LEVELLING
 
 
-def on_one_floor(flights: Sequence[Flight], kept_apart: Sequence[Flight]) -> tuple[list[Flight], list[Flight]]:
+def with_common_floor(flights: Sequence[Flight], kept_apart: Sequence[Flight]) -> tuple[list[Flight], list[Flight]]:
     """The flights; those without a floor get the floor of the others, if these agree and the flight is not below it."""
     everyone = [*flights, *kept_apart]
     shown = [f.ground for f in everyone if f.grounded]

@@ -23,7 +23,7 @@ from crazyem.diagnosis.settings import LEVELLING, RECORDINGS
 from crazyem.vehicle import GRAVITY
 
 
-def alike(flights: Sequence[Flight], kept_apart: Sequence[Flight]) -> tuple[list[Flight], list[Flight]]:
+def in_mean_frame(flights: Sequence[Flight], kept_apart: Sequence[Flight]) -> tuple[list[Flight], list[Flight]]:
     """The flights with their pose frames turned to the mean frame of the fitted flights.
 
     The variance between recordings is estimated beside the error of each recording (DerSimonian and Laird 1986). If it

@@ -18,7 +18,7 @@ def swapped(fitted: Sequence[Flight], kept_apart: Sequence[Flight]) -> bool:
     """
     if not kept_apart:
         return False
-    here, there = np.array([_quick(f) for f in fitted]), np.array([_quick(f) for f in kept_apart])
+    here, there = np.array([_rms_motion(f) for f in fitted]), np.array([_rms_motion(f) for f in kept_apart])
     hovers = bool(np.all(here[:, 0] < RECORDINGS.hover_speed) and np.all(here[:, 1] < RECORDINGS.hover_rate))
     return hovers and bool(
         np.any(there[:, 0] > max(RECORDINGS.hover_speed, RECORDINGS.speed_ratio * float(here[:, 0].max())))
@@ -32,7 +32,7 @@ def swap_sentence(fitted: Sequence[str], kept_apart: Sequence[str]) -> str:
     return f"{first}: only hovers, so {here} (--strict-held-out forbids that)"
 
 
-def _quick(flight: Flight) -> NDArray:
+def _rms_motion(flight: Flight) -> NDArray:
     """(2,) rms of the horizontal speed [m/s] and of the body rate [rad/s]; NaN where not measured."""
     return np.array([_rms(flight.y[:, 3:5]), _rms(flight.y[:, 10:13])])
 

@@ -58,7 +58,7 @@ class RecordingNuisances:
         return [{"name": None, **dict(zip(keys, f, strict=True)), "expected": 0.0, "usual": None} for f in found]
 
 
-def owned(
+def nuisances_of_recordings(
     flights: Sequence[Flight], kept_apart: Sequence[Flight], strengths: Mapping[str, float] | None = None
 ) -> tuple[RecordingNuisances, ...]:
     """The nuisances of all flights, held-out ones last; `strengths` by name of the recording."""

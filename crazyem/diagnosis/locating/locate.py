@@ -169,7 +169,7 @@ def _one(model: Model, point: Point, workers: Workers) -> tuple[list[Finding], D
         if i >= 6 and i not in (9, 10, 11):
             continue
         findings += _constant_and_change(i, b[:, i], a[:, i], dispersion[i], flight, times, unit[i])
-    path = model.shown if model.shown is not None else swept.filtered
+    path = model.rows_path if model.rows_path is not None else swept.filtered
     room = model.sweep(point, world_columns(rotation_matrix(path[:, 6:10])))
     findings += _of_the_world(model, point, room, times, findings)
     in_time = _in_time(point, times, (b, a), (room.score, np.einsum("bii->bi", room.information)))

@@ -82,13 +82,13 @@ def slope_finding(data: Data, slopes: NDArray, errors: NDArray, nats: float, veh
 
 def _path(model: Model) -> NDArray:
     """The filtered path; the measured one if the model left the range of numbers."""
-    return initial_path(model.flight) if model.shown is None else model.shown
+    return initial_path(model.flight) if model.rows_path is None else model.rows_path
 
 
 def _gram(data: Data, point: Point, centre: NDArray) -> Gram:
     score, information, flight = [], [], []
     for k, model in enumerate(data.models):
-        if model.shown is None:
+        if model.rows_path is None:
             model.sweep(point)
         path = _path(model)
         axes = rotation_matrix(path[:, 6:10])  # row i: world axis i in the body

@@ -213,9 +213,9 @@ def humps(model: Model, point: Point) -> list[Finding]:
     found = []
     for i, at, ratio, pieces, _ in peaks(model, point):
         amplitude, sd = amplitude_of(model, point, i, at)
-        if model.shown is None:  # the model left the range of numbers
+        if model.rows_path is None:  # the model left the range of numbers
             continue
-        frequency, rate, _ = spectrum(np.interp(grid, flight.time, model.shown[:, 10 + i]), period)
+        frequency, rate, _ = spectrum(np.interp(grid, flight.time, model.rows_path[:, 10 + i]), period)
         band = np.abs(frequency - at) <= SPECTRUM.hump_width
         swing = float(np.sqrt(2 * np.trapezoid((rate * (2 * np.pi * frequency) ** 2)[band], frequency[band])))
         torque = amplitude * float(units_of(point)[3 + i])

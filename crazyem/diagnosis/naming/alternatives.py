@@ -12,14 +12,14 @@ import numpy as np
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError
-from crazyem.diagnosis.fitting.nuisances import refine_anew, refine_base, without
-from crazyem.diagnosis.naming.detection_limits import at_the_end, matters
-from crazyem.diagnosis.naming.load_or_rotors import refitted, tuned_of
-from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, margin, not_beaten
+from crazyem.diagnosis.fitting.nuisances import refine_base, refine_with_memory, without
+from crazyem.diagnosis.naming.detection_limits import exceeds_limit, is_implausible
+from crazyem.diagnosis.naming.load_or_rotors import occam_cost_of, refitted
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, margin, undominated
 from crazyem.diagnosis.settings import SELECTION
 
 
-def named_again(
+def with_better_rivals(
     data: Data, held_out: Data | None, selection: Selection, say: Callable[[str], None] = lambda text: None
 ) -> Selection:
     """The selection in which a rival replaces each effect if it explains more, or as much with fewer parameters.
@@ -55,7 +55,7 @@ def _reselected(
 ) -> Selection:
     step = next(s for s in selection.steps if s.taken and s.taken.candidate.effect == name)
     mine = next(c for c in selection.accepted if c.effect == name)
-    ended = at_the_end(selection.final, mine)  # then it stands for something else, whatever its evidence
+    ended = is_implausible(selection.final, mine)  # then it stands for something else, whatever its evidence
     others = close_alternatives(step, selection.accepted, near=np.inf if ended else SELECTION.rival_difference)
     if not others:
         return selection
@@ -69,7 +69,7 @@ def _reselected(
         starts.append((point, _in_place(selection.accepted, mine, rival.candidate)))
     found = data.workers.map(lambda start: refitted(data, held_out, *start), starts)
     tried = [
-        replace(trial, candidate=c, value=value, blocks=blocks, tuned=tuned_of(c, accepted, known))
+        replace(trial, candidate=c, value=value, blocks=blocks, tuned=occam_cost_of(c, accepted, known))
         for trial, c, (_, accepted), (value, blocks, known) in zip(
             [step.taken, *others], [mine, *(t.candidate for t in others)], starts, found, strict=True
         )
@@ -79,7 +79,7 @@ def _reselected(
     best = max(asked, key=lambda t: t.worth)
     equals = [t for t in asked if t is best or not distinguishable(best, t, recordings=False)]
     group = [t for t in asked if t is best or not distinguishable(best, t)]
-    unbeaten = not_beaten(equals)
+    unbeaten = undominated(equals)
     chosen = min(unbeaten, key=lambda t: (len(t.candidate.free), -t.value), default=best)
     rest = [t for t in step.trials if t is not step.taken and all(t.candidate is not r.candidate for r in tried)]
     trials = (*asked, *rest)  # an effect at the end of its range is no rival
@@ -92,14 +92,16 @@ def _reselected(
     accepted = _in_place(selection.accepted, mine, chosen.candidate)
     assert chosen.fitted is not None
     values = {chosen.candidate.effect: chosen.candidate.values(chosen.fitted.point)}
-    fitted = refine_anew(data, without(selection.final, name).with_effects(values), accepted)
-    if not matters(fitted.point, chosen.candidate, data):
+    fitted = refine_with_memory(data, without(selection.final, name).with_effects(values), accepted)
+    if not exceeds_limit(fitted.point, chosen.candidate, data):
         return selection
     say(f"  beside the others it is {chosen.candidate.label}")
     return replace(selection, final=fitted.point, fitted=fitted, accepted=tuple(accepted), steps=steps)
 
 
-def exchanged(data: Data, selection: Selection, old: Candidate, new: Candidate, values: Sequence[float]) -> Selection:
+def with_replacement(
+    data: Data, selection: Selection, old: Candidate, new: Candidate, values: Sequence[float]
+) -> Selection:
     """The selection fitted with the effect `new` in the place of `old`; its free parameters start at `values`."""
     bare = without(selection.final, old.effect)
     point = bare.with_effects({new.effect: {**new.neutral(bare), **dict(zip(new.free, values, strict=True))}})

@@ -12,11 +12,11 @@ from scipy.special import logit
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.nuisances import by_a_wrong_lag, solved, systematic_sd
-from crazyem.diagnosis.naming.balance import Balance, how_weak, prefers
+from crazyem.diagnosis.fitting.nuisances import error_by_lag, solved, systematic_sd
+from crazyem.diagnosis.naming.balance import Balance, log_odds_by_balance, rotor_loss
 from crazyem.diagnosis.naming.balance import steady as steadily
-from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, instead_of_a_load
-from crazyem.diagnosis.naming.named import Named, Value, one_factor, trust
+from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, load_substitutes
+from crazyem.diagnosis.naming.named import Named, Value, one_factor, structure_factor
 from crazyem.diagnosis.naming.steady_odds import decided_by_balance
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, preferred, wald
 from crazyem.diagnosis.naming.unexplained import Unexplained
@@ -80,7 +80,7 @@ def answer_of(
         rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, selection, corroborated), balance)
         against = _against(remains, candidate, data)
         there = step.taken.presence(order)
-        there *= trust(against, step.taken.held_out) if step.taken.log_odds is None else 1.0
+        there *= structure_factor(against, step.taken.held_out) if step.taken.log_odds is None else 1.0
         confidence = there * preferred(step.taken, rivals)
         confidence /= 1.0 + sum(float(np.exp(-nats)) for nats in steady.values())
         doubted = candidate.effect in selection.doubted
@@ -124,7 +124,7 @@ def numbers_of(data: Data, selection: Selection, balance: Balance | None) -> lis
     sd, width, _, _ = _uncertainty(selection.fitted)
     never = systematic_sd(data, selection.final)
     never |= {
-        name: float(np.hypot(never.get(name, 0.0), off)) for name, off in by_a_wrong_lag(data, selection.fitted).items()
+        name: float(np.hypot(never.get(name, 0.0), off)) for name, off in error_by_lag(data, selection.fitted).items()
     }
     found, at = [], 0
     for candidate in selection.accepted:
@@ -206,7 +206,7 @@ def _by_the_day(candidate: Candidate, point: Point, balance: Balance | None) -> 
     if balance is None or CATALOGUE[candidate.effect].imbalance != "rotor" or not steadily(candidate):
         return None
     scale = float(candidate.values(point)["scale"])
-    sd = how_weak(balance, int(dict(candidate.fixed)["rotor"]))[1]
+    sd = rotor_loss(balance, int(dict(candidate.fixed)["rotor"]))[1]
     reach = sd * float(stats.t.ppf(0.975, balance.freedom))
     value = Value(scale, candidate.parameter("scale").unit, sd, (max(scale - reach, 0.0), scale + reach))
     return {"scale": value}, 2.0 * float(stats.t.sf((1.0 - scale) / sd, balance.freedom))
@@ -244,7 +244,7 @@ def _steady_rivals(
     """The rivals that the balance cannot judge, and the nats by which it prefers the candidate to the others."""
     if balance is None:
         return list(rivals), {}
-    said = [(t, prefers(balance, candidate, t.candidate)) for t in rivals]
+    said = [(t, log_odds_by_balance(balance, candidate, t.candidate)) for t in rivals]
     nats: dict[str, float] = {}
     for trial, margin in said:
         if margin is not None:
@@ -273,7 +273,7 @@ def _in_place(
     pair = in_place.get(candidate.effect)
     if pair is None or distinguishable(*pair):
         return ()
-    return [c.effect for c in instead_of_a_load(selection.final.vehicle)] if candidate.effect == LOAD else [LOAD]
+    return [c.effect for c in load_substitutes(selection.final.vehicle)] if candidate.effect == LOAD else [LOAD]
 
 
 def _as_a_factor(candidate: Candidate, step: Step, point: Point, covariance: NDArray) -> Sequence[str]:

@@ -21,7 +21,7 @@ from crazyem.diagnosis.fitting.days import day_freedom, day_sd
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, refine
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import nuisances, solved, with_nuisances
-from crazyem.diagnosis.naming.alternatives import exchanged
+from crazyem.diagnosis.naming.alternatives import with_replacement
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.settings import LOADS, SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -64,10 +64,10 @@ def balance_of(data: Data, point: Point) -> Balance:
     as_lack = np.diag([-1.0 / filed[0], 1.0, 1.0, 1.0])  # a larger scale is a smaller lack
     own = as_lack @ solved(fitted)[0].covariance[:4, :4] @ as_lack
     covariance = own + np.diag(np.square(day_sd(point.vehicle)))
-    return Balance(as_lack @ (found - filed), covariance, without_each(data, point), day_freedom(point.vehicle))
+    return Balance(as_lack @ (found - filed), covariance, rotor_signatures(data, point), day_freedom(point.vehicle))
 
 
-def without_each(data: Data, point: Point) -> NDArray:
+def rotor_signatures(data: Data, point: Point) -> NDArray:
     """(4, 4) rows: missing thrust, relative, and torque over thrust [m] without one rotor, by the mean commands."""
     vehicle = point.vehicle
     thrust = np.concatenate([
@@ -115,7 +115,7 @@ def _loaded(root: NDArray, lack: NDArray) -> float:
     return float(minimize_scalar(distance, bounds=(0.0, LOADS.max_load / (1.0 + LOADS.max_load)), method="bounded").fun)
 
 
-def prefers(balance: Balance, one: Candidate, other: Candidate) -> float | None:
+def log_odds_by_balance(balance: Balance, one: Candidate, other: Candidate) -> float | None:
     """Nats by which the balance prefers one effect to the other; None where it cannot judge one of them."""
     mine, its = (balance_loglik(balance, c.effect, dict(c.fixed)) if steady(c) else None for c in (one, other))
     return None if mine is None or its is None else mine - its
@@ -136,14 +136,14 @@ def _numbers(candidate: Candidate) -> int:
     return FREE[CATALOGUE[candidate.effect].imbalance]
 
 
-def how_weak(balance: Balance, rotor: int) -> tuple[float, float]:
+def rotor_loss(balance: Balance, rotor: int) -> tuple[float, float]:
     """Share of its thrust that rotor 1 to 4 lacks by the balance if it alone is weak, and the standard deviation."""
     root = np.linalg.cholesky(np.linalg.inv(balance.covariance)).T
     moved = root @ balance.rotors[rotor - 1]
     return float(moved @ root @ balance.lack / (moved @ moved)), float(1.0 / np.linalg.norm(moved))
 
 
-def hidden_by_the_day(data: Data, selection: Selection, asked: Sequence[Candidate]) -> dict[str, str]:
+def hidden_by_daily_variation(data: Data, selection: Selection, asked: Sequence[Candidate]) -> dict[str, str]:
     """Effect -> how large a weak rotor the differences between days hide, in a sentence, if no steady effect was found.
 
     Empty without a trim in the file, with a steady effect, or if weak rotors were not among the candidates `asked`.
@@ -156,7 +156,7 @@ def hidden_by_the_day(data: Data, selection: Selection, asked: Sequence[Candidat
     except (DivergedError, np.linalg.LinAlgError):
         reason = "not asked: what is steady in this flight fits no model"
         return {ROTOR_FAULT.name: reason, PAYLOAD.name: reason}
-    lacks = [how_weak(balance, rotor) for rotor in (1, 2, 3, 4)]
+    lacks = [rotor_loss(balance, rotor) for rotor in (1, 2, 3, 4)]
     reach = float(stats.t.ppf(0.975, balance.freedom)) * max(sd for _, sd in lacks)
     each = ", ".join(str(round(100 * lack)) for lack, _ in lacks)
     text = (
@@ -186,7 +186,7 @@ def by_balance(data: Data, selection: Selection) -> tuple[Selection, Balance | N
             return _sized(data, selection, mine, {n: decided[mine][n] for n in mine.free}), balance
         selection, mine = _named(data, selection, mine, balance)
         if CATALOGUE[mine.effect].imbalance == "rotor":
-            lack = how_weak(balance, int(dict(mine.fixed)["rotor"]))[0]
+            lack = rotor_loss(balance, int(dict(mine.fixed)["rotor"]))[0]
             if 0.0 < lack < 1.0:
                 selection = _sized(data, selection, mine, {"scale": 1.0 - lack})
     except (DivergedError, np.linalg.LinAlgError):  # then the filter's likelihood decides alone
@@ -200,7 +200,7 @@ def _named(data: Data, selection: Selection, mine: Candidate, balance: Balance) 
     step = next(s for s in selection.steps if s.taken and s.taken.candidate.effect == mine.effect)
     rivals: list[tuple[float, Trial]] = []
     for trial in step.explanations():
-        nats = prefers(balance, mine, trial.candidate)
+        nats = log_odds_by_balance(balance, mine, trial.candidate)
         if nats is not None and trial.fitted is not None:
             rivals.append((nats, trial))
     beaten = [r for r in rivals if r[0] < -SELECTION.separating]
@@ -215,7 +215,7 @@ def _instead(data: Data, selection: Selection, step: Step, old: Candidate, trial
     """The selection with an effect replaced by another trial of the same turn."""
     assert trial.fitted is not None
     values = [float(trial.candidate.values(trial.fitted.point)[n]) for n in trial.candidate.free]
-    found = exchanged(data, selection, old, trial.candidate, values)
+    found = with_replacement(data, selection, old, trial.candidate, values)
     steps = tuple(replace(s, taken=trial) if s is step else s for s in selection.steps)
     return replace(found, steps=steps)
 

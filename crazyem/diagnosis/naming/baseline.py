@@ -11,7 +11,7 @@ from crazyem.diagnosis.fitting.days import day_sd
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.fit import nominal as nominal_of
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import nuisances, refine_base, with_trim_noise
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming.balance import balance_of
@@ -73,7 +73,7 @@ def rotor_aerodynamics(data: Data, point: Point) -> dict[str, dict[str, float]]:
 
 def _nominal(data: Data, vehicle: Vehicle) -> Point:
     """The vehicle's model with the noise of these flights."""
-    bare = Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, first_guess())
+    bare = Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, start_noise())
     return with_trim_noise(data, nominal_of(data, bare))
 
 

@@ -15,7 +15,7 @@ from crazyem.physics.effects.external_force import GUSTS
 from crazyem.physics.effects.prior import Conditions
 
 
-def at_the_end(point: Point, candidate: Candidate) -> bool:
+def is_implausible(point: Point, candidate: Candidate) -> bool:
     """Whether an effect of one number is at an end of its range, or a drag is more than the air can cause."""
     here = candidate.values(point)
     most = CATALOGUE[candidate.effect].most_per_mass * point.vehicle.mass
@@ -79,13 +79,13 @@ def usual_gusts(point: Point, data: Data | None = None) -> float:
     return max(LOADS.min_gust_ratio * filed, limit)
 
 
-def matters(point: Point, candidate: Candidate, data: Data | None = None) -> bool:
+def exceeds_limit(point: Point, candidate: Candidate, data: Data | None = None) -> bool:
     """Whether the effect exceeds its detection limit and is not at an end of its range.
 
     Onboard filters and the sampling of a log look like smaller effects. At an end, an effect stands for something else.
     """
     here, neutral = candidate.values(point), candidate.neutral(point)
-    if at_the_end(point, candidate) or (data is not None and not _outweighs(point, candidate, data)):
+    if is_implausible(point, candidate) or (data is not None and not _outweighs(point, candidate, data)):
         return False
     effect, conditions = CATALOGUE[candidate.effect], _conditions(point, data)
     prior = effect.prior

@@ -54,7 +54,7 @@ def not_determined(candidate: Candidate, parameters: Mapping[str, Value], point:
             return f"not determined: its {said} has no finite size or interval"
         if not low <= value.value <= high:
             return f"not determined: its {said} would be {value.value:.3g}, and {low:.3g} to {high:.3g} is possible"
-        if at_an_end(value.value, (low, high), neutral[name]):
+        if at_bound(value.value, (low, high), neutral[name]):
             return f"not determined: its {said} is at the end of what is possible, {value.value:.3g}"
         if not value.ci95[0] <= value.value <= value.ci95[1]:
             return f"not determined: its {said} is outside of its own interval"
@@ -76,7 +76,7 @@ def improbable(chance: float) -> str:
     return f"not determined: the flights make it probable with {chance:.2g} only"
 
 
-def at_an_end(value: float, ends: tuple[float, float], neutral: float) -> bool:
+def at_bound(value: float, ends: tuple[float, float], neutral: float) -> bool:
     """Whether a number is at an end of its range; neutral is no end."""
     near = CONFIDENCE.at_bound * max(abs(e) for e in ends)
     return min(abs(value - e) for e in ends) <= near and abs(value - neutral) > near
@@ -135,7 +135,7 @@ def _without_ends(candidate: Candidate, found: Mapping[str, Value], point: Point
     """The candidate without numbers at an end; None if there are none, or if no number or no amplitude would remain."""
     neutral, amplitude = candidate.neutral(point), CATALOGUE[candidate.effect].amplitude
     rest = tuple(
-        n for n in candidate.free if not at_an_end(found[n].value, candidate.range_of(n), float(neutral[n]))
+        n for n in candidate.free if not at_bound(found[n].value, candidate.range_of(n), float(neutral[n]))
     )  # fmt: skip
     if rest == candidate.free or not rest or (amplitude in candidate.free and amplitude not in rest):
         return None

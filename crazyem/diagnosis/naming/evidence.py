@@ -12,9 +12,9 @@ from crazyem.diagnosis.fitting.fit import (
     Fitted,
     bounds_of,
     freedom_of,
-    held_near,
     local_precision,
-    moved,
+    nuisance_bounds,
+    with_change,
 )
 from crazyem.diagnosis.fitting.gram import bounded
 from crazyem.diagnosis.fitting.model import Point
@@ -23,7 +23,7 @@ from crazyem.diagnosis.settings import SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 
-def tuning(candidates: Sequence[Candidate], covariance: NDArray) -> float:
+def occam_cost(candidates: Sequence[Candidate], covariance: NDArray) -> float:
     """Cost of the parameters (k, in order) of effects [nats]: the log ratio of prior to posterior volume.
 
     As in Laplace's approximation of the evidence (MacKay 1992). Example: a load that explains weak rotors must sit in
@@ -31,24 +31,24 @@ def tuning(candidates: Sequence[Candidate], covariance: NDArray) -> float:
     costs nothing by this ratio. The cost is at least one nat for each parameter, because chance gains as much.
 
     Args:
-        covariance: (k, k), with the usual spread as prior (`known_of`).
+        covariance: (k, k), with the usual spread as prior (`posterior_covariance`).
     """
-    root = np.linalg.inv(np.linalg.cholesky(_usual(candidates)))
+    root = np.linalg.inv(np.linalg.cholesky(_prior_covariance(candidates)))
     left = np.linalg.eigvalsh(root @ covariance @ root.T)
     return max(float(len(root)), -0.5 * float(np.sum(np.log(np.clip(left, 1e-12, 1.0)))))
 
 
-def known_of(candidates: Sequence[Candidate], curvature: NDArray) -> NDArray:
+def posterior_covariance(candidates: Sequence[Candidate], curvature: NDArray) -> NDArray:
     """(k, k) covariance of the candidates' parameters, with their usual spread as prior and all else free.
 
     These parameters come first in the curvature (n, n)."""
-    usual = _usual(candidates)
+    usual = _prior_covariance(candidates)
     with_prior = curvature.copy()
     with_prior[: len(usual), : len(usual)] += np.linalg.inv(usual)
     return _inverse(with_prior)[: len(usual), : len(usual)]
 
 
-def _usual(candidates: Sequence[Candidate]) -> NDArray:
+def _prior_covariance(candidates: Sequence[Candidate]) -> NDArray:
     """(k, k) prior covariance of the parameters about neutral."""
     width = np.array([c.parameter(n).width for c in candidates for n in c.free])
     which = np.repeat(np.arange(len(candidates)), [len(c.free) for c in candidates])
@@ -59,11 +59,11 @@ def _usual(candidates: Sequence[Candidate]) -> NDArray:
     return covariance
 
 
-def gain_of_both(
+def joint_gain(
     fitted: Fitted, held_out: Data, there: Fitted, accepted: Sequence[Candidate]
 ) -> tuple[float, NDArray, NDArray]:
     """Further gain [nats] of an effect fitted to one set of flights if it were fitted to both; log-likelihood of the
-    held-out flights then, by blocks (b,); covariance (k, k) of the accepted parameters by both sets (`known_of`).
+    held-out flights then, by blocks (b,); `posterior_covariance` (k, k) of the accepted parameters by both sets.
 
     One step starts at `there`, the fit of the held-out flights with the effect as `fitted`. The curvature at `fitted`
     is the prior of the effect's parameters. A parameter that is also a nuisance may differ between the two sets, by its
@@ -89,10 +89,10 @@ def gain_of_both(
     back = 0.5 * float(paid @ np.square(away[:own]) - away[:own] @ known[:own, :own] @ away[:own])
     rest = score - known @ away
     near = np.diag(known) * (np.arange(len(away)) >= own)
-    low, high = held_near(*bounds_of(parts, there.point), away, near, freedom)
+    low, high = nuisance_bounds(*bounds_of(parts, there.point), away, near, freedom)
     step = bounded(information + known, rest, low, high)
     gain = float(rest @ step - 0.5 * step @ (information + known) @ step)
-    blocks, covariance = held_out.block_loglik(there.point), known_of(accepted, information + known)
+    blocks, covariance = held_out.block_loglik(there.point), posterior_covariance(accepted, information + known)
     if gain < SELECTION.linear_gain:
         return back + gain, blocks, covariance
     # a linear gain this large is unreliable: the likelihood after the step decides
@@ -100,7 +100,7 @@ def gain_of_both(
     begin, best = looked.loglik(there.point) - 0.5 * float(away @ known @ away), 0.0
     for part in (1.0, 0.5, 0.25):
         moves = part * step
-        point = moved(there.point, parts, moves)
+        point = with_change(there.point, parts, moves)
         with np.errstate(over="ignore", invalid="ignore"):
             brought = looked.loglik(point, passes=2) - begin
         brought -= 0.5 * float((away + moves) @ known @ (away + moves))
@@ -111,9 +111,9 @@ def gain_of_both(
     return back + min(best, gain), blocks, covariance
 
 
-def known_by(fitted: Fitted, accepted: Sequence[Candidate]) -> NDArray:
-    """(k, k) covariance of the accepted parameters at the maximum (`known_of`)."""
-    return known_of(accepted, fitted.gram.total(range(fitted.gram.size))[1] + np.diag(fitted.precision))
+def accepted_covariance(fitted: Fitted, accepted: Sequence[Candidate]) -> NDArray:
+    """(k, k) covariance of the accepted parameters at the maximum (`posterior_covariance`)."""
+    return posterior_covariance(accepted, fitted.gram.total(range(fitted.gram.size))[1] + np.diag(fitted.precision))
 
 
 def _total(data: Data, point: Point, parts: Sequence[Candidate]) -> tuple[NDArray, NDArray]:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.nuisances import on_held_out, refine_base, without
-from crazyem.diagnosis.naming.evidence import gain_of_both, known_by, tuning
+from crazyem.diagnosis.fitting.nuisances import held_out_fit, refine_base, without
+from crazyem.diagnosis.naming.evidence import accepted_covariance, joint_gain, occam_cost
 from crazyem.diagnosis.naming.trials import Selection, Trial
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.mass_properties import CENTER_OF_MASS, PAYLOAD
@@ -28,12 +28,12 @@ WEAKER = THRUST
 SHIFTED = Candidate(CENTER_OF_MASS.name, (), ("x", "y", "z"))
 
 
-def instead_of_a_load(vehicle: Vehicle) -> list[Candidate]:
+def load_substitutes(vehicle: Vehicle) -> list[Candidate]:
     """Weaker rotors and a shifted centre of mass; with a trim in the vehicle file, a nuisance, the rotors alone."""
     return [WEAKER] if TRIM in vehicle.effects else [WEAKER, SHIFTED]
 
 
-def as_two(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
+def load_against_rotors(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
     """Trials of the load and of its best substitute, weaker rotors with or without a shifted centre of mass; None if no
     load was found or a fit diverges.
     """
@@ -41,33 +41,33 @@ def as_two(data: Data, held_out: Data | None, selection: Selection) -> tuple[Tri
     step = next((s for s in selection.steps if s.taken and s.taken.candidate is load), None)
     if load is None or step is None or step.taken is None:
         return None
-    most = instead_of_a_load(selection.final.vehicle)
+    most = load_substitutes(selection.final.vehicle)
     try:
         value, blocks, known = refitted(data, held_out, selection.final, selection.accepted)
-        others = [_in_place_of_a_load(data, held_out, selection, most[:n]) for n in range(1, len(most) + 1)]
+        others = [_substitute_trial(data, held_out, selection, most[:n]) for n in range(1, len(most) + 1)]
     except DivergedError:
         return None
-    taken = replace(step.taken, value=value, blocks=blocks, tuned=tuned_of(load, selection.accepted, known))
+    taken = replace(step.taken, value=value, blocks=blocks, tuned=occam_cost_of(load, selection.accepted, known))
     return taken, max(others, key=lambda t: t.worth)
 
 
-def _in_place_of_a_load(data: Data, held_out: Data | None, selection: Selection, instead: Sequence[Candidate]) -> Trial:
+def _substitute_trial(data: Data, held_out: Data | None, selection: Selection, instead: Sequence[Candidate]) -> Trial:
     """Effects in the place of a load, as one trial; a second effect costs the log of the number of effects."""
     rest = [c for c in selection.accepted if c.effect not in {LOAD, *(t.effect for t in instead)}]
     bare = without(selection.final, LOAD)
     bare = bare.with_effects({c.effect: c.neutral(bare) for c in instead})
     value, blocks, known = refitted(data, held_out, bare, [*rest, *instead])
     free = tuple(f"{c.effect}.{n}" for c in instead for n in c.free)  # only their number is used
-    cost = tuning(instead, known[-len(free) :, -len(free) :]) + np.log(len(CATALOGUE)) * (len(instead) - 1)
-    return _stands(Candidate(WEAKER.effect, (), free), value, blocks, float(cost))
+    cost = occam_cost(instead, known[-len(free) :, -len(free) :]) + np.log(len(CATALOGUE)) * (len(instead) - 1)
+    return _comparison_trial(Candidate(WEAKER.effect, (), free), value, blocks, float(cost))
 
 
-def _stands(candidate: Candidate, value: float, blocks: NDArray, tuned: float) -> Trial:
+def _comparison_trial(candidate: Candidate, value: float, blocks: NDArray, tuned: float) -> Trial:
     """A trial of effects in the place of another effect, used for the comparison with it alone."""
     return Trial(candidate, 0.0, 0.0, 1.0, 0.0, 0.0, blocks=blocks, value=value, tuned=tuned)
 
 
-def as_load(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
+def rotors_against_load(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
     """Trials of weaker rotors and of a load in their place; None without weaker rotors, if the selection found or
     fitted a load anyway, or if a fit diverges.
     """
@@ -87,8 +87,8 @@ def as_load(data: Data, held_out: Data | None, selection: Selection) -> tuple[Tr
         other, others, known_load = refitted(data, held_out, loaded, [*rest, HEAVIER])
     except DivergedError:
         return None
-    taken = replace(step.taken, value=value, blocks=blocks, tuned=tuned_of(weaker, selection.accepted, known))
-    return taken, _stands(HEAVIER, other, others, tuned_of(HEAVIER, [*rest, HEAVIER], known_load))
+    taken = replace(step.taken, value=value, blocks=blocks, tuned=occam_cost_of(weaker, selection.accepted, known))
+    return taken, _comparison_trial(HEAVIER, other, others, occam_cost_of(HEAVIER, [*rest, HEAVIER], known_load))
 
 
 def refitted(
@@ -99,15 +99,15 @@ def refitted(
     fitted = refine_base(here, start, candidates, noise=False)
     value, blocks = fitted.loglik, here.block_loglik(fitted.point)
     if held_out is None:
-        return value, blocks, known_by(fitted, candidates)
+        return value, blocks, accepted_covariance(fitted, candidates)
     apart = held_out.twin()
-    there = on_held_out(apart, fitted.point, candidates)
-    more, beyond, known = gain_of_both(fitted, apart, there, candidates)
+    there = held_out_fit(apart, fitted.point, candidates)
+    more, beyond, known = joint_gain(fitted, apart, there, candidates)
     return value + there.loglik + more, np.append(blocks, beyond), known
 
 
-def tuned_of(one: Candidate, candidates: Sequence[Candidate], known: NDArray) -> float:
+def occam_cost_of(one: Candidate, candidates: Sequence[Candidate], known: NDArray) -> float:
     """Cost of the parameters of one candidate [nats], by the covariance (k, k) of those of all candidates."""
     begin = sum(len(c.free) for c in candidates[: [c is one for c in candidates].index(True)])
     own = slice(begin, begin + len(one.free))
-    return tuning([one], known[own, own])
+    return occam_cost([one], known[own, own])

@@ -12,7 +12,7 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.naming import accelerometer, rotor_response
 from crazyem.diagnosis.naming.detection_limits import usual_gusts
 from crazyem.diagnosis.naming.gusts import find_gusts
-from crazyem.diagnosis.naming.named import Named, Value, around, trust
+from crazyem.diagnosis.naming.named import Named, Value, interval_95, structure_factor
 from crazyem.diagnosis.naming.presence import presence, presence_by_odds
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.diagnosis.settings import ACCELEROMETER, CONFIDENCE, SELECTION, WIND
@@ -46,7 +46,9 @@ def other_likelihoods(
                 reach = np.exp(np.log(gusts.memory) + np.array([-1.96, 1.96]) * gusts.memory_sd)
             low, high = np.clip(reach, p.low, p.high)
             values = {
-                "standard_deviation": Value(gusts.speed, "m/s", gusts.speed_sd, around(gusts.speed, gusts.speed_sd)),
+                "standard_deviation": Value(
+                    gusts.speed, "m/s", gusts.speed_sd, interval_95(gusts.speed, gusts.speed_sd)
+                ),
                 "correlation_time": Value(gusts.memory, "s", memory_sd, (float(low), float(high))),
             }
             held = gusts.gain
@@ -56,7 +58,7 @@ def other_likelihoods(
             if held > 0:
                 # the gain of the regression says nothing of gusts: their own gain counts
                 left = replace(remains.without_force(), gained=gusts.gain)
-                sure = trust(left, held) * presence(gusts.gain, held, gusts.gain)
+                sure = structure_factor(left, held) * presence(gusts.gain, held, gusts.gain)
                 chance = float(np.exp(-min(held, 700.0)))
                 found.append(Named(GUSTS.name, GUSTS.name, values, {}, held, chance, sure, log_odds=float(logit(sure))))
     if not wanted or accelerometer.EFFECT in wanted:
@@ -69,7 +71,7 @@ def other_likelihoods(
             held = accelerometer.held_out_gain(apart or data, point, angles, yaw_sd=float(sd[2]))
             enough = max(solution.p_value, wald) < SELECTION.p_value and held > SELECTION.min_evidence
             if enough and np.abs(angles[:2]).max() > ACCELEROMETER.min_angle:
-                values = {n: Value(float(a), "rad", float(e), around(float(a), float(e)))
+                values = {n: Value(float(a), "rad", float(e), interval_95(float(a), float(e)))
                           for n, a, e in zip(accelerometer.ANGLES, angles, sd, strict=True)}  # fmt: skip
                 dispersion = max(1.0, solution.dispersion)
                 sure = presence(solution.gain / dispersion, held, solution.gain, dispersion=dispersion)
@@ -101,7 +103,7 @@ def late_rotors(
     named = []
     for name, (value, sd) in late.values.items():
         p = CATALOGUE[name].parameters[0]
-        values = {p.name: Value(value, p.unit, sd, around(value, sd))}
+        values = {p.name: Value(value, p.unit, sd, interval_95(value, sd))}
         p_value = float(np.exp(-min(late.nats, 700.0)))
         there = presence_by_odds(min(late.held_out, late.nats))
         sure = there * (0.5 if late.alike else 1.0)

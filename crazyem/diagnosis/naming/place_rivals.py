@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
-from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, remembering_anew
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, with_torque_memory_refit
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import refine_base, solved, without
 from crazyem.diagnosis.locating.locate import AXES, Finding
@@ -50,7 +50,7 @@ def by_place(
     def both(start: Point, candidates: list[Candidate], rounds: int) -> tuple[Fitted, Data]:
         together = data.together_with(held_out)  # a hover does not determine slopes
         for _ in range(rounds):  # the first noise scales are those without the force
-            fit = refine_base(together, remembering_anew(together, start), candidates)
+            fit = refine_base(together, with_torque_memory_refit(together, start), candidates)
             start = fit.point
         return fit, together
 
@@ -64,7 +64,7 @@ def by_place(
         finding = _finding(again, instead, better)
         if finding is None:
             return selection, None
-        found = refine_base(data, remembering_anew(data, instead.point), [*rest, FORCE])
+        found = refine_base(data, with_torque_memory_refit(data, instead.point), [*rest, FORCE])
     except DivergedError:  # the model diverges without the effects: they stay
         return selection, None
     say("  it is a force by place")

@@ -23,7 +23,7 @@ from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
 
-def without_what_misleads(
+def without_worse_predictions(
     data: Data,
     selection: Selection,
     vehicle: Vehicle,
@@ -43,7 +43,7 @@ def without_what_misleads(
     nominal = [_errors_of(r, vehicle) for r in shown]
 
     def worse(accepted: Sequence[Candidate]) -> float:
-        fitted = with_found(vehicle, selection, accepted)
+        fitted = with_accepted_effects(vehicle, selection, accepted)
         return ratio(nominal, [_errors_of(r, fitted) for r in shown])
 
     while selection.accepted and worse(selection.accepted) > SELECTION.max_error_ratio:
@@ -57,7 +57,7 @@ def without_what_misleads(
     return selection
 
 
-def with_found(vehicle: Vehicle, selection: Selection, accepted: Sequence[Candidate]) -> Vehicle:
+def with_accepted_effects(vehicle: Vehicle, selection: Selection, accepted: Sequence[Candidate]) -> Vehicle:
     """The vehicle with the accepted effects at their fitted values."""
     kept = {n: dict(v) for n, v in vehicle.effects.items()}
     for candidate in accepted:

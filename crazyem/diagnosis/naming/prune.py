@@ -11,16 +11,16 @@ from crazyem.diagnosis.fitting.fit import Data, Fitted
 from crazyem.diagnosis.fitting.gram import used
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import (
-    as_held_out,
+    can_be_finding,
+    held_out_fit,
+    held_out_twin,
     nuisances,
-    on_held_out,
     refine_base,
-    usual_named,
     without,
 )
 from crazyem.diagnosis.locating.random_torques import off_peak_gram, peaks
-from crazyem.diagnosis.naming.detection_limits import at_the_end
-from crazyem.diagnosis.naming.trials import Selection, Step, both, dispersion_of, significance, wald
+from crazyem.diagnosis.naming.detection_limits import is_implausible
+from crazyem.diagnosis.naming.trials import Selection, Step, dispersion_of, p_value_of_both, significance, wald
 from crazyem.diagnosis.settings import FITTING, SELECTION
 
 
@@ -32,7 +32,7 @@ def pruned(
     `nominal` is the model before any nuisance is fitted.
     """
     fitted, accepted, steps = selection.fitted, list(selection.accepted), list(selection.steps)
-    held_out = held_out and as_held_out(held_out, fitted.point, accepted)
+    held_out = held_out and held_out_twin(held_out, fitted.point, accepted)
     fitted, accepted, steps = backward_elimination(data, fitted, accepted, steps, held_out, say)
     doubted: frozenset[str] = frozenset()
     if TRIM not in selection.final.vehicle.effects:  # both judge by the scatter of blocks (see `by_gain`)
@@ -60,9 +60,9 @@ def backward_elimination(
     kept = [s.taken.candidate for s in steps if s.taken and s.taken.log_odds is not None]  # the balance decides
     while accepted:
         here = data.loglik(fitted.point, passes=2)
-        held_here = on_held_out(held_out, fitted.point, accepted).loglik if held_out else 0.0
+        held_here = held_out_fit(held_out, fitted.point, accepted).loglik if held_out else 0.0
         judged = []
-        bare = data.workers.map(partial(bare_fit, data, held_out, fitted, accepted), accepted)
+        bare = data.workers.map(partial(fit_without, data, held_out, fitted, accepted), accepted)
         for k, (c, (less, held_less)) in enumerate(zip(accepted, bare, strict=True)):
             step = next(s for s in steps if s.taken and s.taken.candidate.effect == c.effect)
             assert step.taken is not None
@@ -87,7 +87,7 @@ def backward_elimination(
             break
         rest = [c for c in accepted if c is not worst[1]]
         bare_of_it = refine_base(data, worst[2].point, rest)
-        if any(at_the_end(bare_of_it.point, c) and not at_the_end(fitted.point, c) for c in rest):
+        if any(is_implausible(bare_of_it.point, c) and not is_implausible(fitted.point, c) for c in rest):
             say(f"  stays, because another would go on to the end of its range: {worst[1].label}")
             kept.append(worst[1])
             data.settle(fitted.point)
@@ -123,16 +123,16 @@ def expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], cand
     return 0.5 * float(away @ inner @ away)
 
 
-def bare_fit(
+def fit_without(
     data: Data, held_out: Data | None, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate
 ) -> tuple[Fitted, float]:
     """The fit without one of the effects, and its log-likelihood on held-out flights; the data stay as they are."""
     rest = [a for a in accepted if a is not candidate]
     here, there = data.twin(), held_out.twin() if held_out else None
-    if usual_named(candidate):
+    if can_be_finding(candidate):
         here, there = here.constraining(candidate.effect), there and there.constraining(candidate.effect)
     less = refine_base(here, without(fitted.point, candidate.effect), rest, rounds=2, noise=False)
-    return less, on_held_out(there, less.point, rest).loglik if there else 0.0
+    return less, held_out_fit(there, less.point, rest).loglik if there else 0.0
 
 
 def without_noise_look_alikes(
@@ -164,7 +164,9 @@ def without_noise_look_alikes(
             p_value = significance(with_memory, len(c.free), offset=offset)
             if held_out and SELECTION.p_value <= p_value < SELECTION.held_out_p_value:
                 taken = next(s.taken for s in steps if s.taken and s.taken.candidate.effect == c.effect)
-                p_value = both(p_value, held_gain(data, held_out, with_memory, accepted, c) / taken.dispersion)
+                p_value = p_value_of_both(
+                    p_value, held_gain(data, held_out, with_memory, accepted, c) / taken.dispersion
+                )
             sure.append(p_value)
             offset += len(c.free)
         worst = int(np.argmax(sure))
@@ -177,8 +179,8 @@ def without_noise_look_alikes(
 
 def held_gain(data: Data, held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate) -> float:
     """Gain of a fitted effect on held-out flights [nats]."""
-    there = on_held_out(held_out, fitted.point, accepted).loglik
-    return there - bare_fit(data, held_out, fitted, accepted, candidate)[1]
+    there = held_out_fit(held_out, fitted.point, accepted).loglik
+    return there - fit_without(data, held_out, fitted, accepted, candidate)[1]
 
 
 def vibration_look_alikes(

@@ -84,7 +84,7 @@ def response(found: Sequence[Answer]) -> Response | None:
     return Response(float(lag), float(delay), covariance + usual)
 
 
-def disobedient(found: Sequence[Answer]) -> Finding | None:
+def unresponsive_rotor(found: Sequence[Answer]) -> Finding | None:
     """The rotor that follows its command worse than the others do, in all recordings; None if there is none."""
     if not found:
         return None

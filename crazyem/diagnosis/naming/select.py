@@ -13,41 +13,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
-from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, freedom_of, held_near, local_precision
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, freedom_of, local_precision, nuisance_bounds
 from crazyem.diagnosis.fitting.gram import Solution, neutral_gain
 from crazyem.diagnosis.fitting.model import Column, Point
 from crazyem.diagnosis.fitting.nuisances import (
-    as_held_out,
-    by_gain,
+    can_be_finding,
+    held_out_fit,
+    held_out_twin,
+    is_nonphysical,
     nuisances,
-    on_held_out,
-    refine_anew,
+    p_value_by_gain,
     refine_base,
-    unlike_a_body,
-    usual_named,
+    refine_with_memory,
     with_nuisances,
     without,
 )
-from crazyem.diagnosis.naming.detection_limits import at_the_end, matters
-from crazyem.diagnosis.naming.evidence import gain_of_both, known_by, tuning
+from crazyem.diagnosis.naming.detection_limits import exceeds_limit, is_implausible
+from crazyem.diagnosis.naming.evidence import accepted_covariance, joint_gain, occam_cost
 from crazyem.diagnosis.naming.onset import date, onset_of
 from crazyem.diagnosis.naming.prune import pruned
-from crazyem.diagnosis.naming.starting_points import best_begun
-from crazyem.diagnosis.naming.steady import as_steady, by_onsets, without_trim_rivals
+from crazyem.diagnosis.naming.starting_points import best_starting_points
+from crazyem.diagnosis.naming.steady import onset_p_value, steady_rivals, without_trim_rivals
 from crazyem.diagnosis.naming.steady_odds import decided_by_balance
 from crazyem.diagnosis.naming.trials import (
     Selection,
     Step,
     Trial,
     additions,
-    both,
     by_evidence,
     dispersion_of,
     distinguishable,
-    not_beaten,
+    is_significant,
+    p_value_of_both,
     separate_evidence,
     significance,
-    sure_enough,
+    undominated,
 )
 from crazyem.diagnosis.settings import SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -78,7 +78,7 @@ def linear_trials(
     weights = np.array([0.0 for c in accepted for _ in c.free] + [w for _, p in free for w in p])
     weights = local_precision(centre, weights, freedom)
     wide_low, wide_high = low, high
-    low, high = held_near(low, high, -centre, weights, freedom)
+    low, high = nuisance_bounds(low, high, -centre, weights, freedom)
     zero = gram.solve(always, precision=weights, prior=centre, low=low, high=high) if always else None
     gain0, held0 = (zero.gain, zero.held_out) if zero else (0.0, 0.0)
     found = []
@@ -91,14 +91,14 @@ def linear_trials(
         solution = gram.solve(order, precision=w, prior=mid, low=lo, high=hi, tested=range(len(order) - k, len(order)))
         dispersion = max(1.0, gram.solve(order[-k:]).dispersion)
         gain, held = (now - then for now, then in zip((solution.gain, solution.held_out), before or (gain0, held0)))
-        p_value = by_gain(point, gain / dispersion, k, len(gram.score), solution.p_value)
+        p_value = p_value_by_gain(point, gain / dispersion, k, len(gram.score), solution.p_value)
         found.append((Trial(c, gain, held, dispersion, p_value, gain / dispersion - k), solution))
 
     for c, mine in zip(tested, index[len(base) :], strict=True):
         later = onset_of(data, point, c, gram, mine)
         if later is not None:
             found += [
-                (replace(t, p_value=by_onsets(point, t.p_value, len(gram.score))), s)
+                (replace(t, p_value=onset_p_value(point, t.p_value, len(gram.score))), s)
                 for t, s in linear_trials(data, point, accepted, [later])
             ]
         if decided_by_balance(point.vehicle, c):  # the balance decides on steady effects, not on later onsets
@@ -116,11 +116,11 @@ def linear_trials(
         lo = np.append(low[near], wide_low[order[len(near) :]])
         hi = np.append(high[near], wide_high[order[len(near) :]])
         asked = next(a for a in candidates if a.effect == c.effect)
-        judge(asked, [always[i] for i in order], w, lo, hi, centre[order], none if usual_named(c) else None)
+        judge(asked, [always[i] for i in order], w, lo, hi, centre[order], none if can_be_finding(c) else None)
     return sorted(found, key=lambda t: -t[0].evidence)
 
 
-def with_started(point: Point, candidate: Candidate, solution: Solution) -> Point:
+def at_linear_size(point: Point, candidate: Candidate, solution: Solution) -> Point:
     """The model with a candidate at the size of the linear approximation."""
     change = solution.theta[len(solution.theta) - len(candidate.free) :]
     if candidate.effect in point.effects and not candidate.begin:
@@ -151,8 +151,8 @@ def held_out_value(held_out: Data | None, point: Point, accepted: Sequence[Candi
     """The held-out flights with the nuisances of this model, and its log-likelihood there."""
     if held_out is None:
         return None, 0.0
-    apart = as_held_out(held_out, point, accepted)
-    return apart, on_held_out(apart, point, accepted).loglik
+    apart = held_out_twin(held_out, point, accepted)
+    return apart, held_out_fit(apart, point, accepted).loglik
 
 
 def fitted_trial(basis: Basis, trial: Trial, solution: Solution, *, say: Callable[[str], None]) -> Trial:
@@ -162,7 +162,7 @@ def fitted_trial(basis: Basis, trial: Trial, solution: Solution, *, say: Callabl
     say(f"  fitting {trial.candidate.label}")
     data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
     try:
-        fit = refine_base(data, with_started(point, trial.candidate, solution), mine, rounds=3, noise=False)
+        fit = refine_base(data, at_linear_size(point, trial.candidate, solution), mine, rounds=3, noise=False)
         return compared(basis, trial, data, fit)
     except DivergedError:  # the linear approximation went too far
         return replace(trial, p_value=1.0)
@@ -171,11 +171,11 @@ def fitted_trial(basis: Basis, trial: Trial, solution: Solution, *, say: Callabl
 def constrained_basis(basis: Basis, candidate: Candidate) -> Basis:
     """The basis without an effect that is a nuisance and a possible finding, too."""
     name = candidate.effect
-    if not usual_named(candidate) or name in basis.data.constrained:
+    if not can_be_finding(candidate) or name in basis.data.constrained:
         return basis
     data, apart = basis.data.constraining(name), basis.held_out and basis.held_out.constraining(name)
     fit = refine_base(data, without(basis.point, name), basis.accepted, rounds=3, noise=False)
-    held = on_held_out(apart.twin(), fit.point, basis.accepted).loglik if apart else 0.0
+    held = held_out_fit(apart.twin(), fit.point, basis.accepted).loglik if apart else 0.0
     return replace(basis, data=data, held_out=apart, value=fit.loglik, held_value=held)
 
 
@@ -184,8 +184,8 @@ def with_held_out_by(basis: Basis, trial: Trial) -> Basis:
     if basis.held_out is None:
         return basis
     assert trial.fitted is not None
-    apart = as_held_out(basis.held_out, trial.fitted.point, [*basis.accepted, trial.candidate])
-    before = on_held_out(apart.twin(), basis.point, basis.accepted).loglik
+    apart = held_out_twin(basis.held_out, trial.fitted.point, [*basis.accepted, trial.candidate])
+    before = held_out_fit(apart.twin(), basis.point, basis.accepted).loglik
     return replace(basis, held_out=apart, held_value=before)
 
 
@@ -195,7 +195,7 @@ def with_noise_refit(basis: Basis, trial: Trial) -> Trial:
     basis = constrained_basis(basis, trial.candidate)
     data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
     try:
-        fit = refine_anew(data, trial.fitted.point, mine, rounds=3)
+        fit = refine_with_memory(data, trial.fitted.point, mine, rounds=3)
         return compared(basis, trial, data, fit)
     except DivergedError:
         return trial
@@ -208,30 +208,30 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
     held, value, mine = trial.held_out, gain, [*basis.accepted, trial.candidate]
     if basis.held_out:
         apart = basis.held_out.twin()
-        there = on_held_out(apart, fit.point, mine)
+        there = held_out_fit(apart, fit.point, mine)
         held = there.loglik - basis.held_value
-        more, beyond, covariance = gain_of_both(fit, apart, there, mine)
+        more, beyond, covariance = joint_gain(fit, apart, there, mine)
         blocks = np.append(blocks, beyond)
         recording = np.append(recording, len(data.models) + apart.recordings_of_blocks())
         value += held + more
     else:
-        covariance = known_by(fit, mine)
+        covariance = accepted_covariance(fit, mine)
     k, offset = len(trial.candidate.free), sum(len(c.free) for c in basis.accepted)
-    tuned = tuning([trial.candidate], covariance[-k:, -k:])
+    tuned = occam_cost([trial.candidate], covariance[-k:, -k:])
     trial = replace(trial, dispersion=dispersion_of(fit, k, offset=offset))
     wald_p = significance(fit, k, offset=offset)
-    wald_p = by_gain(fit.point, gain / trial.dispersion, k, len(fit.gram.score), wald_p)
+    wald_p = p_value_by_gain(fit.point, gain / trial.dispersion, k, len(fit.gram.score), wald_p)
     # at a start that derivatives do not lead to, the score test says nothing
-    sure = both(
+    sure = p_value_of_both(
         wald_p if trial.candidate.likeliest else max(trial.p_value, wald_p),
         held / trial.dispersion if basis.held_out else 0.0,
     )
-    sure = sure if matters(fit.point, trial.candidate, data) else 1.0
+    sure = sure if exceeds_limit(fit.point, trial.candidate, data) else 1.0
     judged = replace(trial, gain=gain, held_out=held, p_value=sure, fitted=fit)
     return replace(judged, blocks=blocks, value=value, recording=recording, tuned=tuned)
 
 
-def may_join(effect: str, found: set[str]) -> bool:
+def compatible(effect: str, found: set[str]) -> bool:
     """Whether an effect may be added to those found: not twice, and not beside another form of itself."""
     together = {effect, *found}
     same_again = any(group <= together for name in together for group in CATALOGUE[name].never_beside)
@@ -245,10 +245,10 @@ def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Call
     trials = by_evidence(fitted, counted=counted)
     rest = [t for t, _ in linear if all(t.candidate is not p.candidate for p in trials)]
     if trim := next((t for t in trials if t.candidate.effect == TRIM and admitted(basis, t)), None):
-        return Step((*trials, *rest), trim, as_steady(trim, [t for t in trials if rivals(t, counted=counted)]))
+        return Step((*trials, *rest), trim, steady_rivals(trim, [t for t in trials if rivals(t, counted=counted)]))
     if not trials or not admitted(basis, trials[0]):
         return Step((*trials, *rest), None)
-    trials, equals = compared_again(basis, trials, say=say)
+    trials, equals = compared_with_refitted_noise(basis, trials, say=say)
     taken = name_of(equals, counted=counted)
     return Step((*trials, *rest), taken, group_of(taken, equals, trials, counted=counted))
 
@@ -256,7 +256,7 @@ def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Call
 def admitted(basis: Basis, trial: Trial) -> bool:
     """Whether a trial has the evidence and the significance to be taken."""
     enough = separate_evidence(trial, counted=basis.held_out is not None) > SELECTION.min_evidence
-    return enough and sure_enough(basis.point, trial.p_value)
+    return enough and is_significant(basis.point, trial.p_value)
 
 
 def select(
@@ -270,7 +270,7 @@ def select(
 ) -> Selection:
     """The effects that explain the flights, beyond those of the selection `begun`."""
     # with a trim in the file noise stays (`with_trim_noise`): a steady torque must not become a torque with memory
-    begin = refine_base if TRIM in nominal_point.vehicle.effects else refine_anew
+    begin = refine_base if TRIM in nominal_point.vehicle.effects else refine_with_memory
     fitted = begin(data, nominal_point, ()) if begun is None else begun.fitted
     nominal = fitted.point if begun is None else begun.nominal
     point, value = fitted.point, fitted.loglik
@@ -279,10 +279,10 @@ def select(
     apart, held_value = held_out_value(held_out, point, accepted)
     first = len(accepted)
     while True:
-        rest = [c for c in candidates if may_join(c.effect, {a.effect for a in accepted})]
+        rest = [c for c in candidates if compatible(c.effect, {a.effect for a in accepted})]
         rest = without_trim_rivals(rest, accepted)
         say(f"looking for effect {len(accepted) + 1} among {len(rest)} candidates")
-        linear = linear_trials(data, point, accepted, best_begun(data, point, accepted, rest))
+        linear = linear_trials(data, point, accepted, best_starting_points(data, point, accepted, rest))
         if len(accepted) > first:
             steps[-1] = replace(steps[-1], beside=additions(steps[-1], [t for t, _ in linear]))
         if len(accepted) >= SELECTION.max_effects:  # the linear trials show what stands beside the last
@@ -296,8 +296,8 @@ def select(
         dated, candidate = date(data, taken.fitted, taken.candidate)
         accepted.append(candidate)
         say(f"  found {candidate.label}: {taken.evidence:.1f} nats")
-        before, fitted = fitted, refine_anew(data, dated.point, accepted)
-        if at_the_end(fitted.point, candidate):
+        before, fitted = fitted, refine_with_memory(data, dated.point, accepted)
+        if is_implausible(fitted.point, candidate):
             # fitted with all nuisances, it is at the end of its physical range: it stands for something else
             say(f"  left out again, at the end of its physical range: {candidate.label}")
             accepted.pop()
@@ -307,7 +307,7 @@ def select(
             data.settle(fitted.point)
             continue
         point, value = fitted.point, fitted.loglik
-        if unlike_a_body(point, accepted):  # `diagnose` reports that
+        if is_nonphysical(point, accepted):  # `diagnose` reports that
             return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates))
         apart, held_value = held_out_value(held_out, point, accepted)
     found = {c.effect for c in accepted}
@@ -339,13 +339,13 @@ def shortlist(linear: Sequence[tuple[Trial, Solution]]) -> list[tuple[Trial, Sol
             names = {t.candidate.effect for t, _ in chosen}
             if name in names and twin not in names:
                 chosen += [e for e in linear if e[0].candidate.effect == twin][:1]
-    chosen += [e for t, _ in chosen for e in imitating(t, chosen, linear)]
+    chosen += [e for t, _ in chosen for e in imitators(t, chosen, linear)]
     asked = [e for e in linear if e[0].candidate.likeliest]
     asked += [e for e in linear if e[0].candidate.effect == TRIM][:1]
     return chosen + [e for e in asked if all(e is not c for c in chosen)]
 
 
-def imitating(
+def imitators(
     trial: Trial, chosen: Sequence[tuple[Trial, Solution]], linear: Sequence[tuple[Trial, Solution]]
 ) -> list[tuple[Trial, Solution]]:
     """Imitators of a trial, at a start where they differ from neutral: at neutral their scores say nothing."""
@@ -360,7 +360,9 @@ def imitating(
     return found
 
 
-def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], None]) -> tuple[list[Trial], list[Trial]]:
+def compared_with_refitted_noise(
+    basis: Basis, trials: list[Trial], *, say: Callable[[str], None]
+) -> tuple[list[Trial], list[Trial]]:
     """The trials, and the best of them with its look-alikes, each of these with its own noise scales.
 
     Trials with nearly the same gain are compared like this, too: the noise of a model without the effect contains much
@@ -409,7 +411,7 @@ def name_of(equals: Sequence[Trial], *, counted: bool) -> Trial:
     but must not name an effect that loses by hundreds of nats.
     """
     near = [t for t in equals if t is equals[0] or not distinguishable(equals[0], t, recordings=False)]
-    simplest = min(not_beaten(near), key=lambda t: (len(t.candidate.free), -t.evidence), default=equals[0])
+    simplest = min(undominated(near), key=lambda t: (len(t.candidate.free), -t.evidence), default=equals[0])
     return simplest if separate_evidence(simplest, counted=counted) > SELECTION.min_evidence else equals[0]
 
 

@@ -22,7 +22,7 @@ from crazyem.diagnosis.settings import SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 
-def best_begun(
+def best_starting_points(
     data: Data, point: Point, accepted: Sequence[Candidate], candidates: Sequence[Candidate]
 ) -> list[Candidate]:
     """The candidates; of those with many starting points, only the ones with the largest gains."""
@@ -48,13 +48,13 @@ def best_begun(
         chaotic = max(gains) > SELECTION.chaos_gain and any(
             model.diverges(family[0].effect, point.vehicle) for model in data.models
         )
-        found = larger(data, point, family) if chaotic else None
+        found = likeliest_start(data, point, family) if chaotic else None
         dropped |= set(family) - ({family[i] for i in best} if found is None else set())
         added += [found] if found is not None else []
     return [*(c for c in candidates if c not in dropped), *added]
 
 
-def larger(data: Data, point: Point, family: Sequence[Candidate]) -> Candidate | None:
+def likeliest_start(data: Data, point: Point, family: Sequence[Candidate]) -> Candidate | None:
     """The likeliest starting point, with its size; None if none is likelier than no effect.
 
     The thrust scale balances the weight of the effect.

@@ -14,7 +14,7 @@ from typing import Any
 from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, nominal, refine
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import nuisances, refine_base, with_nuisances, with_trim_noise, without
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.naming.onset import ONSET
@@ -26,7 +26,7 @@ from crazyem.physics.effects.rotors import TORQUE_SCALE
 from crazyem.vehicle import Vehicle
 
 
-def left_as_trim(flights: Sequence[Flight], vehicle: Vehicle, remains: Unexplained, workers: Workers) -> Vehicle:
+def with_remaining_trim(flights: Sequence[Flight], vehicle: Vehicle, remains: Unexplained, workers: Workers) -> Vehicle:
     """The fitted vehicle with the trim of these flights, if a steady torque is unexplained and the file has no trim."""
     steady = any(f.signal == "torque" and not f.variable for f in remains.findings)
     if not steady or TRIM in vehicle.effects or all(f.coarse for f in flights):  # commands lack torques
@@ -34,7 +34,7 @@ def left_as_trim(flights: Sequence[Flight], vehicle: Vehicle, remains: Unexplain
     trim = Candidate(TRIM, (), ("x", "y", "z"))
     untrimmed = replace(vehicle, effects={**vehicle.effects, TRIM: dict.fromkeys(trim.free, 0.0)})
     data = Data(flights, workers)
-    point = nominal(data, Point(untrimmed, {n: dict(v) for n, v in untrimmed.effects.items()}, first_guess()))
+    point = nominal(data, Point(untrimmed, {n: dict(v) for n, v in untrimmed.effects.items()}, start_noise()))
     found = refine_base(data, with_trim_noise(data, point), [trim, THRUST]).point.effects
     steady_now = {TRIM: {n: float(found[TRIM][n]) for n in trim.free}, THRUST.effect: _scale_of(found)}
     return replace(vehicle, effects={**vehicle.effects, **steady_now})
@@ -75,7 +75,7 @@ def with_exact_torques(data: Data, selection: Selection) -> Selection:
     return replace(selection, final=fitted.point, fitted=fitted)
 
 
-def as_steady(trim: Trial, rivals: Sequence[Trial]) -> tuple[Trial, ...]:
+def steady_rivals(trim: Trial, rivals: Sequence[Trial]) -> tuple[Trial, ...]:
     """Rivals that explain a steady torque as well as a trim or better: an unknown trim is their look-alike.
 
     So a trim is taken first if it is a candidate: every real drone has one. Only a file with the known trim, from a
@@ -100,6 +100,6 @@ def without_trim_rivals(candidates: Sequence[Candidate], accepted: Sequence[Cand
     return kept
 
 
-def by_onsets(point: Point, p_value: float, blocks: int) -> float:
+def onset_p_value(point: Point, p_value: float, blocks: int) -> float:
     """The p-value of an onset, times the number of blocks with a trim in the file: no later test follows there."""
     return min(1.0, p_value * blocks) if TRIM in point.vehicle.effects else p_value

@@ -156,7 +156,7 @@ def better(one: Trial, other: Trial, *, recordings: bool = True) -> float:
     return min(by_scatter, by_odds) if nats > 0.0 else max(by_scatter, by_odds)
 
 
-def not_beaten(near: Sequence[Trial]) -> list[Trial]:
+def undominated(near: Sequence[Trial]) -> list[Trial]:
     """The trials that no significant other beats with a probability of more than 1 - `SELECTION.beaten`."""
     sure = [t for t in near if t.p_value < SELECTION.p_value]
     return [t for t in near if all(t is o or better(t, o, recordings=False) > SELECTION.beaten for o in sure)]
@@ -223,7 +223,7 @@ def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
     return frozenset(t.candidate.effect for t in fitted if 0 < SELECTION.kept_share * t.gain < left[t.candidate.effect])
 
 
-def both(p_value: float, held: float) -> float:
+def p_value_of_both(p_value: float, held: float) -> float:
     """p-value on fitted and held-out flights, where the fitted effect brings `held` nats.
 
     The likelihood ratio of two fixed models exceeds exp(held) by chance with a probability of at most exp(-held).
@@ -267,6 +267,6 @@ def wald(away: NDArray, covariance: NDArray, gram: Gram, columns: float) -> floa
     return float(stats.f.sf(distance / len(z), len(z), max(len(gram.score) - columns, 3)))
 
 
-def sure_enough(point: Point, p_value: float) -> bool:
+def is_significant(point: Point, p_value: float) -> bool:
     """Whether the p-value is small enough for the effect to be taken."""
     return p_value < (SELECTION.daily_p_value if TRIM in point.vehicle.effects else SELECTION.p_value)

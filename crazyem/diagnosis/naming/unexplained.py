@@ -107,7 +107,7 @@ def notable(finding: Finding, point: Point, *, differ: bool = False) -> bool:
     return abs(finding.effect_size) > TOLERANCE.get(finding.signal, 0.0) * daily * size
 
 
-def shaking(rate: NDArray, window: NDArray, k: int) -> float:
+def rate_change(rate: NDArray, window: NDArray, k: int) -> float:
     """rad/s: change of a rate's part at one frequency within a step; an unknown torque would leave all of it."""
     amplitude = 2 * np.abs(np.fft.rfft((rate - rate.mean()) * window))[max(k - 2, 0) : k + 3].max() / window.sum()
     return float(amplitude * min(1.0, 2 * np.pi * k / rate.size))
@@ -137,7 +137,9 @@ def lines(swept: Swept, time: NDArray) -> list[Finding]:
             nats = float(ratio - np.log(power.size))
             where = f"frequency {frequency[k]:.2f} Hz"
             size = float(2 * np.sqrt(power[k]) / window.sum() * np.sqrt(np.median(swept.variance[seen, 9 + i])))
-            if size < SPECTRUM.min_line_torque * shaking(np.interp(grid, time, swept.filtered[:, 10 + i]), window, k):
+            if size < SPECTRUM.min_line_torque * rate_change(
+                np.interp(grid, time, swept.filtered[:, 10 + i]), window, k
+            ):
                 continue  # the loop swings at that frequency, and the model misses a small part of the swing
             span = (float(time[0]), float(time[-1]))
             sd = size / float(np.sqrt(max(ratio, 1.0)))

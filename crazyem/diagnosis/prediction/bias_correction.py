@@ -116,14 +116,14 @@ def correction_weights(turned: Turned, starts: NDArray, *, horizon: float, befor
             continue
         sd = np.array([PREDICTION.weight_sd, PREDICTION.offset_sd * lag, *(s * lag for s in PREDICTION.feedback_sd)])
         for axis in range(3):
-            found = regressed(
+            found = regression(
                 explaining[:, axis], came[:, axis], sd, max(1.0, lag / turned.period), turned.period, at[known],
                 before=None if before is None else before[k - 1, axis],
             )  # fmt: skip
             weight[known, k, axis] = np.clip(found[:, 0], 0.0, PREDICTION.max_weight)
             added[known, k, axis] = found[:, 1] + np.einsum("nf,nf->n", found[:, 2:], here[known, axis])
     weight[:, 0] = weight[:, 1]
-    return Weights(lags, weight, added, lacked(turned, starts))
+    return Weights(lags, weight, added, mean_missing_force(turned, starts))
 
 
 def moments(turned: Turned, *, horizon: float) -> NDArray:
@@ -147,7 +147,7 @@ def _products(x: NDArray, y: NDArray) -> NDArray:
     return np.column_stack([x[:, i] * x[:, j], x * y[:, None], y * y, np.ones_like(y)])
 
 
-def regressed(
+def regression(
     x: NDArray, y: NDArray, sd: NDArray, alike: float, period: float, at: NDArray, *, before: NDArray | None = None
 ) -> NDArray:
     """(n, c) coefficients of y (k,) on the columns of x (k, c), from rows up to each of `at` (n,).
@@ -178,7 +178,7 @@ def regressed(
     return solved
 
 
-def lacked(turned: Turned, starts: NDArray) -> NDArray:
+def mean_missing_force(turned: Turned, starts: NDArray) -> NDArray:
     """(n, 3) m/s^2, mean specific force that the model lacked before each start, shrunk towards 0."""
     rows = np.flatnonzero(turned.flying & np.isfinite(turned.lacking).all(1))
     found = np.zeros((starts.size, 3))
@@ -199,7 +199,7 @@ def lacked(turned: Turned, starts: NDArray) -> NDArray:
     return found
 
 
-def remembered(value: NDArray, counting: NDArray, period: float) -> NDArray:
+def weighted_mean(value: NDArray, counting: NDArray, period: float) -> NDArray:
     """(r, k): mean of the counted rows (r, k) up to each row; before the first counted row, the row itself.
 
     Weights of older rows are smaller (`PREDICTION.memory`)."""

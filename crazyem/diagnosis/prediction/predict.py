@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights.flight import COLUMNS
 from crazyem.diagnosis.flights.inputs import Inputs, inputs_of
-from crazyem.diagnosis.prediction.bias_correction import Turned, correction_weights, remembered
+from crazyem.diagnosis.prediction.bias_correction import Turned, correction_weights, weighted_mean
 from crazyem.diagnosis.prediction.simulate import Simulator
 from crazyem.diagnosis.settings import LEVELLING, PREDICTION, RECORDINGS
 from crazyem.errors import DataError
@@ -305,7 +305,7 @@ def _at_start(shown: Recorded, gained: NDArray, flying: NDArray) -> NDArray:
     rotation = rotation_matrix(shown.state[:, 6:10])
     rate, velocity = shown.state[:, 10:13], np.einsum("nji,nj->ni", rotation, shown.state[:, 3:6])
     place, arrived = shown.state[:, :3], np.concatenate([[False], flying[:-1]])
-    away = np.einsum("nji,nj->ni", rotation, place - remembered(place, arrived, shown.period))
+    away = np.einsum("nji,nj->ni", rotation, place - weighted_mean(place, arrived, shown.period))
     across = [
         np.column_stack([v[:, 1], -v[:, 0], np.zeros(len(v))])
         for v in (rotation[:, 2], velocity, velocity * velocity[:, 2:], away)

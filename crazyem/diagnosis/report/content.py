@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from crazyem.diagnosis.report.quantities import items, number, per_cent, quantity, short, span, table, tables
-from crazyem.diagnosis.report.verdict import QUANTITIES, Document, alike, said_of, spaced, words_of
+from crazyem.diagnosis.report.verdict import QUANTITIES, Document, alike, effect_words, spaced, words_of
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 MOST_RANKED = 12
@@ -147,7 +147,7 @@ def _bar(value: float | None, ends: Sequence[float | None], none: float | None) 
 
 
 def _groups(document: Document) -> list[Items]:
-    groups = [f"{' and '.join(map(said_of, g))} cannot be told apart in this flight" for g in alike(document)]
+    groups = [f"{' and '.join(map(effect_words, g))} cannot be told apart in this flight" for g in alike(document)]
     separate = _texts(document.get("would_separate"))
     title = f"What would tell {'them apart' if groups else 'more'}"
     return [*_listed(groups, warn=True), *_listed(separate, title=title)]
@@ -225,7 +225,7 @@ def _unknown(document: Document) -> Iterable[Text | Items | Table]:
     for entry in items(document.get("not_identifiable")):
         known = isinstance(entry, Mapping)
         name, reason = (entry.get("name"), entry.get("reason", "")) if known else (entry, "")
-        reasons.setdefault(str(reason), []).append(said_of(name))
+        reasons.setdefault(str(reason), []).append(effect_words(name))
     texts = [f"{', '.join(names)}{f': {reason}' if reason else ''}" for reason, names in reasons.items()]
     yield from _listed(texts, title="What this flight could not reveal")
 
@@ -249,7 +249,7 @@ def _ranking(document: Document) -> list[Text | Table]:
     for entry in entries[:MOST_RANKED]:
         held = number(entry.get("held_out_nats"))
         share = 100 * max(held or 0.0, 0.0) / best if best > 0 else 0.0
-        words = spaced(entry["words"]) if entry.get("words") else said_of(entry.get("name", ""))
+        words = spaced(entry["words"]) if entry.get("words") else effect_words(entry.get("name", ""))
         note = str(entry.get("note", "")) or ("told" if str(entry.get("name")) in named else "")
         rows.append((words, short(entry.get("gain_nats"), ".1f"), short(held, ".1f"), Meter(round(share, 1)), note))
     heads = ("candidate", "gain", "held out", "", "")

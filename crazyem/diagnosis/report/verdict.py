@@ -40,7 +40,7 @@ def claim(document: Document) -> str:
     effects, groups = tables(document.get("effects")), alike(document)
     if not effects:
         return f"Simulation and flight differ, and none of the known effects explains it{_strongest(document)}."
-    hardly = [e for e in effects if _hardly(e, groups)]
+    hardly = [e for e in effects if _is_improbable(e, groups)]
     lacks = joined([_named(e, groups) for e in effects if e not in hardly])
     nearest, spoilt = joined([_named(e, groups) for e in hardly]), worse(document)
     if spoilt:
@@ -93,7 +93,7 @@ def spaced(name: Any) -> str:
     return str(name).replace("_", " ")
 
 
-def said_of(name: Any) -> str:
+def effect_words(name: Any) -> str:
     """An effect in words, by its name."""
     return CATALOGUE[str(name)].said({}) if str(name) in CATALOGUE else spaced(name)
 
@@ -130,7 +130,7 @@ def _judge(document: Document) -> tuple[Mapping[str, Any], str]:
     return next(((part, words) for part, words in found if part.get("before") and part.get("after")), ({}, ""))
 
 
-def _hardly(effect: Mapping[str, Any], groups: Iterable[Sequence[str]]) -> bool:
+def _is_improbable(effect: Mapping[str, Any], groups: Iterable[Sequence[str]]) -> bool:
     """Whether an effect outside all groups is improbable, so that it must not be called missing."""
     sure = number(effect.get("confidence"))
     return sure is not None and sure < CONFIDENCE.improbable and not any(effect.get("name") in g for g in groups)
@@ -143,7 +143,7 @@ def _named(effect: Mapping[str, Any], groups: Iterable[Sequence[str]]) -> str:
     how = f" ({'; '.join(filter(None, about))})" if any(about) else ""
     group = next((g for g in groups if name in g and set(g) != {name}), None)
     if group:
-        others = joined([said_of(g) for g in group if g != name], "or")
+        others = joined([effect_words(g) for g in group if g != name], "or")
         return f"{words_of(effect)} (or {others}, which this flight cannot tell from it){how}"
     return words_of(effect) + how
 
