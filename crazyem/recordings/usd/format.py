@@ -9,14 +9,15 @@ Only the id of a record gives its length, so the records must be located one aft
 of one kind; one comparison locates a whole run. Alternating kinds need a plain loop (0.3 us per record).
 """
 
-import struct
 from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
+from crazyem.recordings.tables import Table
 
 USD_MAGIC = 0xBC
 USD_VERSIONS = (1, 2)
@@ -34,9 +35,9 @@ TYPE_LETTERS: dict[str, tuple[str, str]] = {
 STAMP_TYPES = {1: ("<u4", 1e3), 2: ("<u8", 1e6)}  # type of a stamp, and stamp units per second
 
 # The firmware writes at most 20 event types of at most 20 variables; damaged counts may be huge.
-_MOST_EVENTS = 256
+MOST_EVENTS = 256
 _MOST_VARIABLES = 1024
-_LONGEST_NAME = 256  # bytes
+LONGEST_NAME = 256  # bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +80,7 @@ def parse_header(data: bytes, path: object) -> Header:
     if version not in USD_VERSIONS:
         raise FileFormatError(f"{path}: uSD card log of version {version}, known are 1 and 2.")
     count = cursor.u16("number of event types")
-    if not 0 < count <= _MOST_EVENTS:
+    if not 0 < count <= MOST_EVENTS:
         raise FileFormatError(f"{path}: the header declares {count} event types (byte 3).")
     events: list[EventType] = []
     for _ in range(count):
@@ -90,15 +91,6 @@ def parse_header(data: bytes, path: object) -> Header:
             raise FileFormatError(f"{path}: the header declares event {event.identifier} twice.")
         seen.add(event.identifier)
     return Header(version, tuple(events), cursor.at)
-
-
-def plausible(head: bytes) -> bool:
-    """True if these first bytes have the form of a log header with a named first event."""
-    if len(head) < 8 or head[0] != USD_MAGIC:
-        return False
-    version, count = struct.unpack_from("<HH", head, 1)
-    name = head[7 : 7 + _LONGEST_NAME].split(b"\0", 1)[0]
-    return 0 < version < 16 and 0 < count <= _MOST_EVENTS and name.isascii() and name.decode("ascii").isprintable()
 
 
 def _event(cursor: "_Cursor", version: int, taken: set[str]) -> EventType:
@@ -141,8 +133,8 @@ class _Cursor:
 
     def name(self, what: str) -> str:
         """The text up to the next NUL; the cursor moves behind the NUL."""
-        end = self.data.find(0, self.at, self.at + _LONGEST_NAME)
-        if end < 0 and len(self.data) < self.at + _LONGEST_NAME:
+        end = self.data.find(0, self.at, self.at + LONGEST_NAME)
+        if end < 0 and len(self.data) < self.at + LONGEST_NAME:
             raise self._cut(what)
         text = self.data[self.at : end]
         if end < 0 or not text.isascii() or not text.decode("ascii").isprintable():
@@ -184,8 +176,11 @@ class Records:
     unknown: int | None
 
 
-def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int) -> Records:
-    """Every whole record of `data[begin:end]` before the first that is cut off or of an unknown kind."""
+def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int, blank: int) -> Records:
+    """Every whole record of `data[begin:end]` before the first that is cut off or of an unknown kind.
+
+    Records that begin at byte `blank` or later are left out: erased flash looks like records of event 0xFFFF.
+    """
     sizes = {event.identifier.to_bytes(2, "little"): event.layout.itemsize for event in events}
     start = array("q")
     append = start.append
@@ -208,15 +203,10 @@ def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int) -> 
         streak = _RUN_RECORDS - 1 if run == _WINDOW_RECORDS else 0  # full window: the run may continue
     starts = np.frombuffer(start, np.int64)
     unknown = int.from_bytes(identifier, "little") if size is None and at + 2 <= end else None
+    count = int(np.searchsorted(starts, blank))
+    if count < starts.size:
+        starts, at, unknown = starts[:count], int(starts[count]), None
     return Records(starts, _kinds(data, events, starts), at, unknown)
-
-
-def written(records: Records, blank: int) -> Records:
-    """The records that begin before byte `blank`: erased flash also looks like records of event 0xFFFF."""
-    count = int(np.searchsorted(records.start, blank))
-    if count == records.start.size:
-        return records
-    return Records(records.start[:count], records.kind[:count], int(records.start[count]), None)
 
 
 def _kinds(data: bytes, events: tuple[EventType, ...], start: NDArray[np.int64]) -> NDArray[np.uint16]:
@@ -249,3 +239,40 @@ def gather(data: bytes, event: EventType, start: NDArray[np.int64]) -> NDArray[n
         rows = start[first : first + step]
         result[first : first + step] = source[rows[:, None] + np.arange(size)]
     return result.reshape(-1).view(event.layout)
+
+
+class Clock:
+    """Stamps of all records in file order as seconds; 32-bit stamps are continued where they wrap (49.7 days)."""
+
+    def __init__(self, header: Header) -> None:
+        self.kind, self.rate = STAMP_TYPES[header.version]
+        self.wraps = header.version == 1
+        self._last: tuple[int, int] | None = None  # the last stamp: raw and continued
+
+    def seconds(
+        self, order: Sequence[NDArray[np.intp]], stamps: Sequence[NDArray[np.unsignedinteger]]
+    ) -> NDArray[np.float64]:
+        """(n,) s of the next records, from the rows and the stamps of each kind."""
+        merged = np.empty(sum(rows.size for rows in order), self.kind)
+        for rows, stamp in zip(order, stamps, strict=True):
+            merged[rows] = stamp
+        if not self.wraps or not merged.size:
+            return merged / self.rate
+        before, value = self._last or (int(merged[0]), int(merged[0]))
+        with np.errstate(over="ignore"):
+            # signed difference modulo 2^32: a step back remains a step back
+            steps = np.diff(merged, prepend=np.uint32(before)).view(np.int32)
+        continued = value + np.cumsum(steps, dtype=np.int64)
+        self._last = int(merged[-1]), int(continued[-1])
+        return continued / self.rate
+
+
+def table(event: EventType, values: NDArray[np.void], time: NDArray[np.float64], rows: NDArray[np.integer]) -> Table:
+    """Records of one kind as a table; `time` and `rows` are their times and places among all records."""
+    return Table(
+        event.name,
+        {name: values[str(i)] for i, name in enumerate(event.variables)},
+        time,
+        rows.astype(np.int64, copy=False),
+        ctypes={name: TYPE_LETTERS[letter][1] for name, letter in zip(event.variables, event.letters, strict=True)},
+    )

@@ -10,18 +10,31 @@ from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
 from crazyem.recordings.contents import pieces
-from crazyem.recordings.finding import Finding
+from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.motor_meaning import MOTOR_VARIABLES
 from crazyem.recordings.tables import Table
-from crazyem.recordings.usd.content import CRC_BYTES, Checksum, Clock, integrity, table
-from crazyem.recordings.usd.format import BLANK_BYTES, EventType, Header, Records, gather, locate, parse_header, written
+from crazyem.recordings.usd.format import BLANK_BYTES, Clock, Header, Records, gather, locate, parse_header, table
 
+CRC_BYTES = 4
 _READ_BYTES = 1 << 22  # bytes read at a time
 _LONGEST_HEADER = 1 << 27  # bytes; more than the limits of usd/format.py allow
 STRETCH_BYTES = 1 << 26  # bytes of records in a part, at any length in time
 _SAMPLED_ROWS = 1 << 19  # rows that decide the meaning of motor.m1..4
 
 Packed = list[NDArray[np.void]]  # records of each kind
+_Piece = tuple[NDArray[np.float64], NDArray[np.uint16], Packed]  # times and kinds in file order, records of each kind
+
+
+@dataclass(frozen=True, slots=True)
+class Checksum:
+    """The last four bytes against the CRC-32 of everything before them; None where the file has no room for one."""
+
+    stored: int | None
+    computed: int | None
+
+    @property
+    def right(self) -> bool:
+        return self.stored is not None and self.stored == self.computed
 
 
 class Survey:
@@ -63,13 +76,46 @@ class Survey:
             for k, sample in samples.items():
                 sample.add(gather(data, self.header.events[k], records.start[order[k]]))
             self.counts = [n + rows.size for n, rows in zip(self.counts, order, strict=True)]
-        self._samples = {k: sample.rows(self.header.events[k]) for k, sample in samples.items()}
+        self._samples = {k: sample.rows(self.header.events[k].layout) for k, sample in samples.items()}
 
     def integrity(self, *, last: float) -> tuple[str, list[Finding]]:
-        """As `content.integrity`."""
-        return integrity(
-            size=self.size, stop=self.stop, unknown=self.unknown, checksum=self.checksum, last=last, blank=self.blank
-        )
+        """Result of the checksum and of the end of the file: one word for the metadata, and findings.
+
+        Args:
+            last: time of the last record [s].
+        """
+        stop, unknown, checksum = self.stop, self.unknown, self.checksum
+        left = self.size - stop - (CRC_BYTES if checksum.right else 0)
+        if checksum.right and not left:
+            return "ok", []
+        evidence = {"offset_bytes": float(stop), "left_bytes": float(left), "last_s": last}
+        verdict, grade, advice = "missing", Grade.HARMLESS, ""
+        if not checksum.right and self.blank <= stop and left > CRC_BYTES:
+            text = (
+                f"From byte {stop} on there are only bytes that nobody wrote (0xFF of erased flash, or 0): "
+                f"{left} bytes were not read (the last record read is at {last:.3f} s; power lost while logging?)."
+            )
+        elif checksum.right or (unknown is not None and left > CRC_BYTES):
+            verdict, grade = "ok" if checksum.right else "wrong", Grade.DEGRADES
+            advice = "Copy the file from the card again; what stands before the place named was read."
+            what = "is cut off" if unknown is None else f"is of the unknown event {unknown}"
+            text = (
+                f"Damaged: the record at byte {stop} {what}; {left} bytes from there on were not read "
+                f"(the last record read is at {last:.3f} s)."
+            )
+        elif left == CRC_BYTES and unknown is not None:  # four bytes that start no record are a checksum
+            verdict, grade, advice = "wrong", Grade.DEGRADES, "Copy the file from the card again."
+            evidence = {"stored": float(checksum.stored or 0), "computed": float(checksum.computed or 0)}
+            text = (
+                f"The CRC is wrong: the file says {checksum.stored:08x}, its bytes give {checksum.computed:08x}; "
+                "at least one byte is not what was written."
+            )
+        else:
+            text = (
+                f"The file was cut off (power lost while logging?): there is no CRC, {left} bytes are left over after "
+                f"the last whole record at {last:.3f} s."
+            )
+        return verdict, [Finding("integrity", grade, text, evidence=evidence, advice=advice)]
 
     def tables(self) -> list[Table]:
         """The tables of the file, with sampled rows if they have motor.m1..4, else without rows."""
@@ -97,8 +143,8 @@ class _Sample:
             self.held = self.kept[0].size
             self.step *= 2
 
-    def rows(self, event: EventType) -> NDArray[np.void]:
-        return np.concatenate([np.empty(0, event.layout), *self.kept])
+    def rows(self, layout: np.dtype[np.void]) -> NDArray[np.void]:
+        return np.concatenate([np.empty(0, layout), *self.kept])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +171,7 @@ def stretches(survey: Survey, seconds: float, largest: float = STRETCH_BYTES) ->
     header = survey.header
     total, first, begin, held_bytes = sum(survey.counts), 0, 0.0, 0
     clock = Clock(header)
-    held: list[tuple[NDArray[np.float64], NDArray[np.uint16], Packed]] = []
+    held: list[_Piece] = []
     rows = 0
     for _, data, records in _walk(survey):
         order = [np.flatnonzero(records.kind == kind) for kind in range(len(header.events))]
@@ -136,7 +182,7 @@ def stretches(survey: Survey, seconds: float, largest: float = STRETCH_BYTES) ->
             begin = begin if held else float(time[at])
             late = np.flatnonzero(time[at:] - begin >= seconds)
             end = at + int(late[0]) + 1 if late.size else time.size
-            held.append(_cut(time, records.kind, order, packed, at, end))
+            held.append(_cut((time, records.kind, packed), order, at, end))
             rows += end - at
             held_bytes += sum(p.nbytes for p in held[-1][2])
             at = end
@@ -148,22 +194,14 @@ def stretches(survey: Survey, seconds: float, largest: float = STRETCH_BYTES) ->
         yield _joined(header, held, first, True)
 
 
-def _cut(
-    time: NDArray[np.float64],
-    kind: NDArray[np.uint16],
-    order: Sequence[NDArray[np.intp]],
-    packed: Packed,
-    at: int,
-    end: int,
-) -> tuple[NDArray[np.float64], NDArray[np.uint16], Packed]:
+def _cut(piece: _Piece, order: Sequence[NDArray[np.intp]], at: int, end: int) -> _Piece:
     """A copy of the records `at` to `end` - 1 of a piece, so that the piece can be freed."""
+    time, kind, packed = piece
     places = [np.searchsorted(rows, (at, end)) for rows in order]
     return time[at:end], kind[at:end], [p[a:b].copy() for p, (a, b) in zip(packed, places, strict=True)]
 
 
-def _joined(
-    header: Header, held: list[tuple[NDArray[np.float64], NDArray[np.uint16], Packed]], first: int, ends: bool
-) -> Stretch:
+def _joined(header: Header, held: list[_Piece], first: int, ends: bool) -> Stretch:
     kind = np.concatenate([k for _, k, _ in held])
     packed = []
     for number, event in enumerate(header.events):
@@ -184,7 +222,7 @@ def _walk(survey: Survey) -> Iterator[tuple[int, bytes, Records]]:
         data += piece
         if len(data) <= skip:
             continue
-        records = written(locate(data, header.events, skip, min(len(data), end - begin)), survey.blank - begin)
+        records = locate(data, header.events, skip, min(len(data), end - begin), survey.blank - begin)
         yield begin, data, records
         if records.unknown is not None or begin + records.stop >= survey.blank:
             return
