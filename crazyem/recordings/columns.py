@@ -3,7 +3,9 @@
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Annotated
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,12 +24,12 @@ class SignalEntry:
 
     Attributes:
         name: in the recording.
-        parts: names of the components, ("",) for a scalar.
+        components: their names, ("",) for a scalar.
         marked: True if some of its samples are marked.
     """
 
     name: str
-    parts: tuple[str, ...]
+    components: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
     quantity: str
     unit: str
     frame: str
@@ -39,8 +41,8 @@ class SignalEntry:
     @property
     def units(self) -> tuple[str, ...]:
         """The unit of each component."""
-        mixed = _MIXED_UNITS.get(self.quantity, ())
-        return mixed if len(mixed) == len(self.parts) else (self.unit,) * len(self.parts)
+        mixed, count = _MIXED_UNITS.get(self.quantity, ()), len(self.components)
+        return mixed if len(mixed) == count else (self.unit,) * count
 
 
 def entry_of(name: str, array: SignalArray) -> SignalEntry:
@@ -83,14 +85,14 @@ class Description:
         used = set(_RESERVED_NAMES)
         columns = []
         for entry in self.entries:
-            wanted = [f"{entry.name}_{part}" if part else entry.name for part in entry.parts]
+            wanted = [f"{entry.name}_{part}" if part else entry.name for part in entry.components]
             units = list(entry.units)
             if entry.marked:
                 wanted.append(f"{entry.name}_{MARKED_COLUMN}")
                 units.append("")
             for component, (name, unit) in enumerate(zip(wanted, units, strict=True)):
-                unique = _unique(_printable(name), used)
-                columns.append(Column(unique, unit, entry, component if component < len(entry.parts) else None))
+                unique = unique_name(_printable(name), used)
+                columns.append(Column(unique, unit, entry, component if component < len(entry.components) else None))
         return tuple(columns)
 
 
@@ -116,7 +118,8 @@ class Column:
         return f"{self.name} [{_printable(self.unit)}]" if self.unit else self.name
 
 
-def _unique(wanted: str, used: set[str]) -> str:
+def unique_name(wanted: str, used: set[str]) -> str:
+    """The name, with "#2", "#3", ... added if it is in `used`, to which the result is added."""
     name, number = wanted, 1
     while name in used:
         number += 1
@@ -175,7 +178,6 @@ def rows_of(recording: Recording, names: Iterable[str], *, samples: int = 1 << 1
     columns of the later sample are further right. So row by row, from left to right, is the processing order.
 
     Args:
-        recording: any.
         names: in the order of the columns; names that the recording does not have are left out.
         samples: largest number of samples of a signal in a block.
     """

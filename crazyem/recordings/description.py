@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -14,20 +13,6 @@ from crazyem.recordings.finding import Finding
 from crazyem.recordings.recording import Event
 
 _LARGEST_ROW = 2**62
-
-
-class _Signal(msgspec.Struct, rename={"parts": "components"}):
-    """A `SignalEntry` in the file."""
-
-    name: str
-    parts: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
-    quantity: str
-    unit: str
-    frame: str
-    clock: str
-    stream: str
-    source: tuple[str, ...]
-    marked: bool = False
 
 
 class _Event(msgspec.Struct, rename={"time": "time_s"}):
@@ -44,7 +29,7 @@ class _File(msgspec.Struct):
     version: Literal[1]
     source: str
     origin_s: float
-    signals: tuple[_Signal, ...]
+    signals: tuple[SignalEntry, ...]
     findings: tuple[Finding, ...]
     events: tuple[_Event, ...]
     metadata: dict[str, dict[str, Any]] = {}
@@ -56,7 +41,7 @@ def to_json(description: Description) -> dict[str, Any]:
         "version": 1,
         "source": description.source,
         "origin_s": _plain(float(description.origin)),
-        "signals": [msgspec.to_builtins(_Signal(**asdict(entry))) for entry in description.entries],
+        "signals": msgspec.to_builtins(description.entries),
         "metadata": _plain(description.metadata or {}),
         "findings": [_plain(_finding(f)) for f in description.findings],
         "events": [_plain({"time_s": float(e.time), "kind": e.kind, "data": e.data}) for e in description.events],
@@ -71,7 +56,7 @@ def from_json(table: Any) -> Description:
     file = msgspec.convert(table, _File, dec_hook=_rows)
     return Description(
         file.source,
-        tuple(SignalEntry(**msgspec.structs.asdict(signal)) for signal in file.signals),
+        file.signals,
         file.origin_s,
         {name: {key: str(value) for key, value in section.items()} for name, section in file.metadata.items()},
         file.findings,

@@ -43,8 +43,6 @@ def export_parts(parts: Any, path: str | Path, *, force: bool = False) -> Descri
 
     Args:
         parts: function without arguments that returns the parts; called twice, for the columns and the samples.
-        path: as in `export`.
-        force: replace an existing file.
     """
     path = Path(path)
     write = {".csv": _write_csv, ".parquet": _write_parquet}.get(path.suffix.lower())
@@ -99,13 +97,9 @@ def _write_csv(description: Description, parts: Iterable[Recording], path: Path)
     from pyarrow import csv as pa_csv
 
     header = io.StringIO()
-    columns = description.columns
-    csv.writer(header, lineterminator="\n").writerow([TIME, HOST_TIME, *(c.title for c in columns)])
-    plain = pa.schema(
-        [pa.field("time", pa.float64()), pa.field("host_time", pa.float64())]
-        + [pa.field(c.name, pa.bool_() if c.component is None else pa.float64()) for c in columns]
-    )
-    schema = pa.schema([pa.field(f.name, pa.int8()) if f.type == pa.bool_() else f for f in plain])  # 1, not "true"
+    csv.writer(header, lineterminator="\n").writerow([TIME, HOST_TIME, *(c.title for c in description.columns)])
+    plain = _schema(description)
+    schema = pa.schema([f.with_type(pa.int8()) if f.type == pa.bool_() else f for f in plain])  # 1, not "true"
     with path.open("wb") as file:
         file.write(header.getvalue().encode("utf-8", "replace"))
         options = pa_csv.WriteOptions(include_header=False)
@@ -115,29 +109,26 @@ def _write_csv(description: Description, parts: Iterable[Recording], path: Path)
 
 
 def _write_parquet(description: Description, parts: Iterable[Recording], path: Path) -> None:
-    import pyarrow as pa
     from pyarrow import parquet
 
-    fields = [_field(name, pa.float64(), {"unit": "s", "description": text}) for name, text in _TIME_COLUMNS.items()]
-    for column in description.columns:
-        kind = pa.bool_() if column.component is None else pa.float64()
-        fields.append(_field(column.name, kind, _about(column)))
-    schema = pa.schema(
-        fields,
-        metadata={
-            "crazyem": json.dumps(to_json(description), allow_nan=False),
-            "PANDAS_ATTRS": json.dumps(attributes(description), allow_nan=False),
-        },
-    )
+    about = {"crazyem": to_json(description), "PANDAS_ATTRS": attributes(description)}
+    texts = {key: json.dumps(value, allow_nan=False) for key, value in about.items()}
+    schema = _schema(description).with_metadata(texts)
     with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
         for block in _blocks(description, parts, schema):
             writer.write_batch(block)
 
 
-def _field(name: str, kind: Any, about: dict[str, str]) -> Any:
+def _schema(description: Description) -> Any:
+    """The Arrow schema of the table; fields have the known properties of their columns."""
     import pyarrow as pa
 
-    return pa.field(name, kind, metadata={k: v.encode("utf-8", "replace") for k, v in about.items()})
+    known = [(name, pa.float64(), {"unit": "s", "description": text}) for name, text in _TIME_COLUMNS.items()]
+    known += [(c.name, pa.bool_() if c.component is None else pa.float64(), _about(c)) for c in description.columns]
+    return pa.schema(
+        pa.field(name, kind, metadata={k: v.encode("utf-8", "replace") for k, v in about.items()})
+        for name, kind, about in known
+    )
 
 
 def _about(column: Column) -> dict[str, str]:
@@ -152,7 +143,7 @@ def _about(column: Column) -> dict[str, str]:
 
 def _source(column: Column) -> str:
     source = column.entry.source
-    if len(source) == len(column.entry.parts) and column.component is not None:
+    if len(source) == len(column.entry.components) and column.component is not None:
         return source[column.component]
     return ", ".join(source)
 
@@ -172,21 +163,13 @@ def attributes(description: Description) -> dict[str, Any]:
 def csvw(description: Description, name: str) -> dict[str, Any]:
     """The CSVW description (https://www.w3.org/TR/tabular-metadata/) of an exported CSV called `name`."""
     columns: list[dict[str, Any]] = [
-        {
-            "titles": title,
-            "name": key,
-            "datatype": "double",
-            "schema:unitText": "s",
-            "dc:description": _TIME_COLUMNS[key],
-        }
-        for title, key in ((TIME, "time"), (HOST_TIME, "host_time"))
+        {"titles": f"{key} [s]", "name": key, "datatype": "double", "schema:unitText": "s", "dc:description": text}
+        for key, text in _TIME_COLUMNS.items()
     ]
     for column in description.columns:
         about = _about(column)
-        kind = "boolean" if column.component is None else "double"
+        kind: Any = {"base": "boolean", "format": "1|0"} if column.component is None else "double"
         entry: dict[str, Any] = {"titles": column.title, "name": quote(column.name, safe=""), "datatype": kind}
-        if kind == "boolean":
-            entry["datatype"] = {"base": "boolean", "format": "1|0"}
         for key, term in (
             ("unit", "schema:unitText"), ("frame", "dc:description"), ("source", "dc:source"),
         ):  # fmt: skip

@@ -51,12 +51,7 @@ def free_memory() -> float:
 def open_parts(
     path: str | Path, options: ReadOptions | None = None, *, seconds: float = PART_SECONDS
 ) -> Iterator[Recording]:
-    """Consecutive parts of a recording; the length of a part bounds the memory.
-
-    Args:
-        path: a file whose reader can read in parts.
-        options: as in `open_recording`.
-        seconds: length of a part.
+    """Consecutive parts of `seconds` each of a recording; the length of a part bounds the memory.
 
     Raises: as `open_recording`; UsageError if the format cannot be read in parts.
     """

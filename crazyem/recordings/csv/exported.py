@@ -66,7 +66,7 @@ class _Held:
         self.entries = entries
         self.first = first  # number of its first row in the file
         self.time, self.host_time = GrowingArray(float), GrowingArray(float)
-        self.value = [GrowingArray(float, len(entry.parts)) for entry in entries]
+        self.value = [GrowingArray(float, len(entry.components)) for entry in entries]
         self.order = [GrowingArray(np.int64) for _ in entries]
         self.marked = [GrowingArray(bool) for _ in entries]
 
@@ -80,7 +80,7 @@ class _Held:
         self.host_time.more(count)[:] = batch.column(1).to_numpy(zero_copy_only=False)
         column = 2
         for place, entry in enumerate(self.entries):
-            parts = [batch.column(column + i) for i in range(len(entry.parts))]
+            parts = [batch.column(column + i) for i in range(len(entry.components))]
             column += len(parts)
             row = _rows_with(parts, count)
             value = self.value[place].more(row.size)
@@ -142,7 +142,6 @@ class _Table:
         self.findings: list[Finding] = []
         self.titles = self._header()
         self.description = self._description()
-        self.columns = self.description.columns
 
     def _header(self) -> list[str]:
         line = next(text_blocks(self.path, Damage(), size=LONGEST_LINE), b"").partition(b"\n")[0]
@@ -157,10 +156,7 @@ class _Table:
     def _description(self) -> Description:
         beside = self.path.with_name(self.path.name.removesuffix(".gz") + METADATA_SUFFIX)
         if not beside.is_file():
-            self._note(
-                f"There is no {beside.name} beside it: frames, clocks and streams are not known.", Grade.DEGRADES
-            )
-            return _guessed(self.titles[2:])
+            return self._guessed(f"There is no {beside.name} beside it: frames, clocks and streams are not known.")
         try:
             if beside.stat().st_size > _LARGEST_DESCRIPTION:
                 raise ValueError("it is too large")
@@ -170,12 +166,13 @@ class _Table:
             what = f"{type(error).__name__}: {error}" if isinstance(error, KeyError | TypeError) else str(error)
             raise FileFormatError(f"{beside} is not the description of an exported recording ({what}).") from None
         if [c.title for c in description.columns] != self.titles[2:]:
-            self._note(f"{beside.name} describes other columns than the file has; it was left out.", Grade.DEGRADES)
-            return _guessed(self.titles[2:])
+            return self._guessed(f"{beside.name} describes other columns than the file has; it was left out.")
         return description
 
-    def _note(self, text: str, grade: Grade = Grade.HARMLESS) -> None:
-        self.findings.append(note("integrity", text, grade))
+    def _guessed(self, why: str) -> Description:
+        """Signals from the titles of their columns alone, and a finding with the reason."""
+        self.findings.append(note("integrity", why, Grade.DEGRADES))
+        return _guessed(self.titles[2:])
 
     def batches(self) -> Iterator[tuple[Any, int]]:
         """The rows of the file, in bounded memory: (RecordBatch, line of its first row).
@@ -225,14 +222,10 @@ class _Table:
 def _guessed(titles: list[str]) -> Description:
     """Signals from the titles of their columns alone."""
     pairs = [name_and_unit(title) for title in titles]
-    names = [name for name, _ in pairs]
     entries = []
     while pairs:
-        name, unit = pairs[0]
-        entry = _vocabulary_entry(names[len(names) - len(pairs) :]) or SignalEntry(
-            name, ("",), *_scalar(name, unit), "", "", (name,)
-        )
-        del pairs[: len(entry.parts)]
+        entry = _first_entry(pairs)
+        del pairs[: len(entry.components)]
         if pairs and pairs[0][0] == f"{entry.name}_{MARKED_COLUMN}":
             del pairs[0]
             entry = replace(entry, marked=True)
@@ -240,18 +233,16 @@ def _guessed(titles: list[str]) -> Description:
     return Description("exported csv", tuple(entries))
 
 
-def _scalar(name: str, unit: str) -> tuple[str, str, str]:
-    """Quantity, unit and frame of a column that is a scalar signal."""
+def _first_entry(pairs: list[tuple[str, str]]) -> SignalEntry:
+    """The signal in the first columns: a vector (position_x, position_y, position_z), else a scalar."""
+    name, unit = pairs[0]
+    for quantity, (count, known, frame) in SIGNALS.items():
+        parts, names = components(quantity), tuple(n for n, _ in pairs[:count])
+        base = name.removesuffix(f"_{parts[0]}") if parts else ""
+        if parts and base.split("@")[0] == quantity and names == tuple(f"{base}_{part}" for part in parts):
+            return SignalEntry(base, parts, quantity, known, frame, "", "", names)
     quantity = name.split("@", maxsplit=1)[0]
     count, known, frame = SIGNALS.get(quantity, (0, "", ""))
-    return (quantity, unit, frame) if count == 1 and unit == known else ("", unit, "")
-
-
-def _vocabulary_entry(names: list[str]) -> SignalEntry | None:
-    """The vocabulary vector in the first columns, as in position_x, position_y, position_z; None if there is none."""
-    for quantity, (count, unit, frame) in SIGNALS.items():
-        parts = components(quantity)
-        base = names[0].removesuffix(f"_{parts[0]}") if parts else ""
-        if parts and base.split("@")[0] == quantity and names[:count] == [f"{base}_{part}" for part in parts]:
-            return SignalEntry(base, parts, quantity, unit, frame, "", "", tuple(names[:count]))
-    return None
+    if count != 1 or unit != known:
+        quantity, frame = "", ""
+    return SignalEntry(name, ("",), quantity, unit, frame, "", "", (name,))

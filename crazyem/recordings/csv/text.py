@@ -21,6 +21,7 @@ import pyarrow.csv
 from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError, UsageError
+from crazyem.recordings.columns import unique_name
 
 BLOCK_BYTES = 4 << 20
 LONGEST_LINE = 1 << 20  # bytes
@@ -121,7 +122,10 @@ def read_header(path: Path) -> Header:
             flags.add(column)
         elif not values and not name:
             hollow.add(column)
-    names, repeated = _unique(given)
+    wanted = [name or f"column {place}" for place, name in enumerate(given, start=1)]
+    used: set[str] = set()
+    names = tuple(unique_name(name, used) for name in wanted)
+    repeated = tuple(dict.fromkeys(name for name, unique in zip(wanted, names) if name != unique))
     return Header(names, repeated, delimiter, decimal, frozenset(words), frozenset(flags), frozenset(hollow))
 
 
@@ -338,21 +342,3 @@ def parse_fields(line: bytes, delimiter: str) -> list[str]:
 def _shown(text: str) -> str:
     short = "".join(c if c.isprintable() else "?" for c in text[:20])
     return f'"{short}"'
-
-
-def _unique(names: list[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Unique names ("#2" added to a second one, "column 3" for an empty one), and the repeated names."""
-    seen: set[str] = set()
-    result, repeated = [], []
-    for place, given in enumerate(names, start=1):
-        name = given or f"column {place}"
-        count = 1
-        unique = name
-        while unique in seen:
-            count += 1
-            unique = f"{name}#{count}"
-        if count > 1:
-            repeated.append(name)
-        seen.add(unique)
-        result.append(unique)
-    return tuple(result), tuple(dict.fromkeys(repeated))
