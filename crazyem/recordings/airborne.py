@@ -10,8 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from crazyem.recordings.finding import intervals_of
-from crazyem.recordings.ordering import Array, Flags, Intervals, common, inside, ordered, thinned
+from crazyem.recordings.finding import intervals_of, runs_of
+from crazyem.recordings.ordering import Array, Flags, Intervals, all_time, common, inside, ordered, thinned
 from crazyem.recordings.recording import Recording
 
 SHORTEST_FLIGHT = 0.4  # s of lift; a shorter one is a hop or a test of the rotors
@@ -95,7 +95,7 @@ def airtime(recording: Recording) -> Airtime:
             found = _beyond_rotors(_above_ground(found, place[0], place[1][:, 2]), *place)
     elif place is not None:
         found = _from_height(*place)
-    return _flagged(found, recording) or Airtime(_all_time(recording), _all_time(recording), (), ())
+    return _flagged(found, recording) or Airtime(all_time(recording), all_time(recording), (), ())
 
 
 # -- rotors -----------------------------------------------------------------------------------------------------------
@@ -179,19 +179,17 @@ def _beyond_rotors(found: Airtime, time: Array, position: Array) -> Airtime:
     ahead = bool(found.flown) and found.flown[0][0] <= found.begin + SHORTEST_FLIGHT
     behind = bool(found.flown) and found.flown[-1][1] >= found.end - SHORTEST_FLIGHT
     alone = _from_height(time, position).flown
-    first = (
-        next((a for a, b in alone if a < found.begin - LONGEST_SILENCE and b > found.begin), None) if ahead else None
-    )
-    last = next((b for a, b in alone if a < found.end and b > found.end + LONGEST_SILENCE), None) if behind else None
+    starts = [a for a, b in alone if ahead and a < found.begin - LONGEST_SILENCE and b > found.begin]
+    ends = [b for a, b in alone if behind and a < found.end and b > found.end + LONGEST_SILENCE]
+    if not starts and not ends:
+        return found
 
     def wider(spans: Intervals) -> Intervals:
         edges = [list(span) for span in spans]
-        edges[0][0] = edges[0][0] if first is None else first
-        edges[-1][1] = edges[-1][1] if last is None else last
+        edges[0][0] = next(iter(starts), edges[0][0])
+        edges[-1][1] = next(iter(ends), edges[-1][1])
         return tuple((a, b) for a, b in edges)
 
-    if first is None and last is None:
-        return found
     judged = tuple(dict.fromkeys((*found.judged_by, "position")))
     return replace(found, airborne=wider(found.airborne), flown=wider(found.flown), judged_by=judged)
 
@@ -289,8 +287,7 @@ def _rests(time: Array, position: Array) -> list[tuple[int, int]]:
     flags = np.zeros(first.size, bool)
     for shift in range(width):
         flags[shift : shift + still.size] |= still
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return [(int(first[a]), int(first[b]) if b < first.size else time.size) for a, b in zip(edges[::2], edges[1::2])]
+    return [(int(first[a]), int(first[b]) if b < first.size else time.size) for a, b in runs_of(flags)]
 
 
 def _allowed(position: Array, count: float) -> Array:
@@ -318,7 +315,7 @@ def _flagged(found: Airtime | None, recording: Recording) -> Airtime | None:
         return found
     says = value[:, 0] > 0.5
     spans = [list(span) for span in intervals_of(time, says)]
-    ((begin, end),) = _all_time(recording)
+    ((begin, end),) = all_time(recording)
     if says[0]:
         spans[0][0] = begin
     if says[-1]:
@@ -359,9 +356,3 @@ def _parted(start: float, end: float, hits: Array) -> list[tuple[float, float]]:
             parts.append((start, float(t) - AROUND_IMPACT))
         start = float(t) + AROUND_IMPACT
     return [(a, b) for a, b in [*parts, (start, end)] if b - a >= SHORTEST_FLIGHT]
-
-
-def _all_time(recording: Recording) -> Intervals:
-    finite = [array.time[np.isfinite(array.time)] for array in recording.signals.values()]
-    times = [t for t in finite if t.size]
-    return ((float(min(t.min() for t in times)), float(max(t.max() for t in times))),) if times else ()

@@ -35,6 +35,7 @@ class ReadOptions:
 
 LARGEST_FILE = 4 << 30  # bytes of a plain file: hours of a uSD log at 1 kHz
 LARGEST_UNPACKED = 1 << 30  # bytes of a gzip file, unpacked: guards against decompression bombs
+_HEAD_BYTES = 64 * 1024
 
 
 def pieces(path: Path, size: int) -> Iterator[bytes]:
@@ -58,6 +59,11 @@ def pieces(path: Path, size: int) -> Iterator[bytes]:
         raise FileFormatError(f"{path} is not a readable gzip file ({error}).") from error
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
+
+
+def head_of(path: Path) -> bytes:
+    """The first bytes of a file, unpacked if it is a gzip file. Raises as `pieces`."""
+    return next(pieces(path, _HEAD_BYTES), b"")
 
 
 def contents(path: Path) -> bytes:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from crazyem.errors import UsageError
 from crazyem.recordings.finding import Finding
+from crazyem.recordings.ordering import all_time
 from crazyem.recordings.recording import Event, Recording
 
 _WHOLE_FLIGHT_SECTION = "statistics"  # section of the metadata that counts packets of the whole flight
@@ -18,7 +19,6 @@ def cut(recording: Recording, start: float | None, end: float | None) -> Recordi
     """The samples from `start` to `end`, both included; the time axis stays as it is.
 
     Args:
-        recording: any.
         start, end: s on the time axis of the recording, as `info` and `doctor` show it; None: no limit.
 
     Raises: UsageError if the limits make no sense or nothing lies between them.
@@ -27,20 +27,20 @@ def cut(recording: Recording, start: float | None, end: float | None) -> Recordi
         return recording
     piece = _cut(recording, *_limits(start, end))
     if not len(piece):
-        times = [a.time[np.isfinite(a.time)] for a in recording.signals.values()]
-        times = [t for t in times if t.size]
-        span = f"from {min(t.min() for t in times):.3f} to {max(t.max() for t in times):.3f} s" if times else "empty"
+        span = "".join(f"from {first:.3f} to {last:.3f} s" for first, last in all_time(recording)) or "empty"
         raise UsageError(f"{recording.path}: there are no samples {_between(start, end)}; the recording is {span}.")
     return piece
 
 
 def cut_parts(parts: Iterator[Recording], start: float | None, end: float | None) -> Iterator[Recording]:
     """As `cut`, of a recording in parts; parts without samples between the limits are left out."""
+    if start is None and end is None:
+        yield from parts
+        return
     limits, path, some = _limits(start, end), "", False
     for part in parts:
-        piece = part if start is None and end is None else _cut(part, *limits)
-        path = part.path
-        if len(piece) or (start is None and end is None):
+        piece, path = _cut(part, *limits), part.path
+        if len(piece):
             some = True
             yield piece
     if not some and path:

@@ -100,7 +100,11 @@ def note(check: str, text: str, grade: Grade = Grade.HARMLESS, **evidence: float
     return Finding(check, grade, text, evidence=evidence)
 
 
+def runs_of(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(k, 2) first row, and row after the last, of each run of True."""
+    return np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))).reshape(-1, 2)
+
+
 def intervals_of(time: NDArray[np.float64], rows: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
     """(start, end) of each run of True, from (n,) times and flags."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], rows, [False]]).astype(np.int8)))
-    return tuple((float(time[a]), float(time[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True))
+    return tuple((float(time[a]), float(time[b - 1])) for a, b in runs_of(rows))

@@ -200,10 +200,9 @@ def _judge_age(tables: Sequence[Table], metadata: Mapping[str, Mapping[str, str]
     elif types == {"int32_t"}:
         votes.age.append(("request", "it is an int32, as until 2020-02-28"))
     version = _version(metadata)
-    if version is not None and version >= _FIRST_NEW_RELEASE:
-        votes.age.append(("duty", f"the firmware is of {version[0]}-{version[1]:02d}"))
-    elif version is not None and version <= _LAST_OLD_RELEASE:
-        votes.age.append(("request", f"the firmware is of {version[0]}-{version[1]:02d}"))
+    if version is not None and not _LAST_OLD_RELEASE < version < _FIRST_NEW_RELEASE:
+        meaning = "duty" if version >= _FIRST_NEW_RELEASE else "request"
+        votes.age.append((meaning, f"the firmware is of {version[0]}-{version[1]:02d}"))
 
 
 def _version(metadata: Mapping[str, Mapping[str, str]]) -> tuple[int, int] | None:
@@ -228,14 +227,11 @@ def _judge_mixer(table: Table, votes: _Votes) -> None:
     share = float(np.logical_and.reduce(whole).mean())
     votes.evidence |= {"mixer_share": share, "mixer_rows": rows}
     _compare_with_mixer(table, motor, usable, votes)
+    text = f"it is on the mixer's whole-number grid in {100 * share:.1f} % of rows"
     if share > 0.9:
-        votes.mixer.append(
-            ("request", f"it is on the mixer's whole-number grid in {100 * share:.1f} % of rows, not compensated")
-        )
+        votes.mixer.append(("request", f"{text}, not compensated"))
     elif share < 0.5:
-        votes.mixer.append(
-            ("duty", f"it is on the mixer's whole-number grid in {100 * share:.1f} % of rows (by chance: 6 %)")
-        )
+        votes.mixer.append(("duty", f"{text} (by chance: 6 %)"))
 
 
 def _compare_with_mixer(table: Table, motor: NDArray[np.float64], usable: NDArray[np.bool_], votes: _Votes) -> None:
@@ -251,6 +247,5 @@ def _compare_with_mixer(table: Table, motor: NDArray[np.float64], usable: NDArra
     equal = float((np.abs(mixed - motor) <= 1.0).all(axis=0)[rows].mean())
     votes.evidence["mixer_equal_share"] = equal
     if equal > 0.5:
-        votes.mixer.append(
-            ("request", f"it is what the mixer makes of controller.cmd_* in {100 * equal:.0f} % of rows")
-        )
+        text = f"it is what the mixer makes of controller.cmd_* in {100 * equal:.0f} % of rows"
+        votes.mixer.append(("request", text))

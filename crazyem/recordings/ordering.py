@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.recordings.recording import SignalArray
+from crazyem.recordings.recording import Recording, SignalArray
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -39,6 +39,13 @@ def thinned(array: SignalArray) -> SignalArray:
     period = (float(array.time[-1]) - float(array.time[0])) / max(array.time.size - 1, 1)
     step = int(FINEST_INTERVAL / period) if 0.0 < period < 0.5 * FINEST_INTERVAL else 1
     return array if step < 2 else array.rows(slice(None, None, step))
+
+
+def all_time(recording: Recording) -> Intervals:
+    """The interval from the first to the last finite stamp of all signals; () without any."""
+    finite = [array.time[np.isfinite(array.time)] for array in recording.signals.values()]
+    times = [t for t in finite if t.size]
+    return ((float(min(t.min() for t in times)), float(max(t.max() for t in times))),) if times else ()
 
 
 def inside(time: Array, intervals: Intervals) -> Flags:

@@ -10,12 +10,10 @@ from pathlib import Path
 from types import ModuleType
 
 from crazyem.errors import FileFormatError, KnownFileError, UsageError
-from crazyem.recordings.contents import ReadOptions, pieces
+from crazyem.recordings.contents import ReadOptions, head_of
 from crazyem.recordings.cut import cut, cut_parts
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.stamps import screened, screened_parts
-
-_HEAD_BYTES = 64 * 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +110,3 @@ def reader_of(path: Path) -> Reader:
         raise KnownFileError(f"{path} {refusal}")
     what = "is empty" if not head else f"is not a recording in a format known here ({known})"
     raise FileFormatError(f"{path} {what}.")
-
-
-def head_of(path: Path) -> bytes:
-    """The first bytes of a file, unpacked if it is a gzip file."""
-    return next(pieces(path, _HEAD_BYTES), b"")

@@ -9,7 +9,7 @@ Python prints them, so every float is exact. Rows are in order of arrival; the f
 import contextlib
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.links.clock import STAMP_MODULUS
 from crazyem.recordings import motor_meaning
-from crazyem.recordings.contents import ReadOptions, contents
+from crazyem.recordings.contents import ReadOptions, contents, head_of
 from crazyem.recordings.csv.file import read as read_csv
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import Recording
@@ -41,7 +41,6 @@ class _Part:
     """One file.
 
     Attributes:
-        path: of the file.
         block: name of the log block; the file name if it does not follow the pattern of cfclient.
         date: start of writing, local time of the host; None if not in the file name.
         variables: names of the columns.
@@ -126,8 +125,6 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _head(file: Path) -> bytes:
-    from crazyem.recordings.registry import head_of  # not at the top: the registry imports this reader
-
     try:
         return head_of(file)
     except (FileFormatError, UsageError):
@@ -190,15 +187,10 @@ def _read_file(path: Path, findings: list[Finding], faults: list[Fault]) -> _Par
     start = data.index(header) + len(header)
     body = data[start:].lstrip(b" \t\r")
     line = data[:start].count(b"\n") + 1
-    if not body.endswith(b"\n") and b"\n" in body:
-        body, _, rest = body.rpartition(b"\n")
-        body += b"\n"
-        if rest.strip():
-            findings.append(
-                note("integrity", f"{path.name}: the last line has no end, it may be cut, and was dropped.")
-            )
-    elif not body.endswith(b"\n"):
-        body = b""
+    body, end, rest = body.rpartition(b"\n")
+    body += end
+    if end and rest.strip():
+        findings.append(note("integrity", f"{path.name}: the last line has no end, it may be cut, and was dropped."))
     segments = [
         _numbers(path, text, len(variables) + 1, line + offset)
         for offset, text in _segments(path, header, body, line, findings)
@@ -297,8 +289,7 @@ def _aligned(parts: Sequence[_Part]) -> list[_Part]:
         apart = float(part.stamp[0] - first.stamp[0])
         waited = (part.date - first.date).total_seconds() * 1000.0 if part.date and first.date else 0.0
         wraps = round((waited - apart) / STAMP_MODULUS)
-        stamp = part.stamp + wraps * STAMP_MODULUS
-        result.append(_Part(part.path, part.block, part.date, part.variables, stamp, part.values))
+        result.append(replace(part, stamp=part.stamp + wraps * STAMP_MODULUS))
     return result
 
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.recordings.finding import runs_of
+
 RELATIVE_TOLERANCE = 1e-4  # of the change over two steps; interpolated rows are below 1e-5, noise is far above 1e-2
 ABSOLUTE_TOLERANCE = 4e-9  # files have nine decimals, rounded
 _CHUNK_ROWS = 1 << 16  # rows processed together, to bound memory
@@ -87,8 +89,8 @@ def corners(
         deviation = np.abs(value[1:-1] - value[:-2] - share * (value[2:] - value[:-2]))
     off = np.zeros(n, bool)
     off[1:-1] = ~(deviation <= ABSOLUTE_TOLERANCE)  # NaN is off every line
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], off, [False]]).astype(np.int8)))
-    begin, length = edges[::2], edges[1::2] - edges[::2]
+    begin, end = runs_of(off).T
+    length = end - begin
     pairs = [
         (begin[length == size, None] + np.arange(0, size, 2)[None, :]).ravel()
         for size in range(2, _LONGEST_GROUP + 1, 2)
