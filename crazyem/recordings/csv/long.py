@@ -1,9 +1,8 @@
 """CSV in long form, one row per variable: raw values of log packets of a Crazyflie."""
 
 import math
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,14 +22,8 @@ from crazyem.signals.sample import SIGNALS
 _LARGEST_STAMP = 2.0**53  # ms
 
 
-@dataclass(slots=True)
-class _Packets:
-    """Packets of one block with the same variables, in order of arrival."""
-
-    time: list[float] = field(default_factory=list)
-    order: list[int] = field(default_factory=list)
-    host_time: list[float] = field(default_factory=list)
-    values: list[list[float]] = field(default_factory=list)
+# (block, variables) -> time, order, host time and values of each packet, in order of arrival
+_Packets = dict[tuple[str, tuple[str, ...]], list[tuple[float, int, float, list[float]]]]
 
 
 @dataclass(slots=True)
@@ -51,7 +44,7 @@ def read_long(path: Path, header: Header, mapping: CsvMapping, options: ReadOpti
     damage = Damage()
     found = _collected(path, header, mapping, damage)
     layouts: dict[str, tuple[str, ...]] = {}
-    most = Counter({key: len(packets.order) for key, packets in found.items()})
+    most = {key: len(packets) for key, packets in found.items()}
     for block, names in sorted(found, key=lambda key: -most[key]):
         layouts.setdefault(block, names)
     tables = [_table(block, names, found[block, names]) for block, names in found if layouts[block] == names]
@@ -77,12 +70,10 @@ def read_long(path: Path, header: Header, mapping: CsvMapping, options: ReadOpti
     return Recording(str(path), f"csv:{mapping.name}", signals, metadata, (*findings, *meaning.findings))
 
 
-def _collected(
-    path: Path, header: Header, mapping: CsvMapping, damage: Damage
-) -> dict[tuple[str, tuple[str, ...]], _Packets]:
-    """All packets by (block, variables). Values of the host get the newest firmware stamp before them."""
+def _collected(path: Path, header: Header, mapping: CsvMapping, damage: Damage) -> _Packets:
+    """All packets. Values of the host get the newest firmware stamp before them."""
     host_variables = {name for signal in mapping.signals.values() for name in signal.columns}
-    found: dict[tuple[str, tuple[str, ...]], _Packets] = {}
+    found: _Packets = {}
     unwrapper = StampUnwrapper()
     now = math.nan
     for order, packet in enumerate(_packets(path, header, mapping, damage)):
@@ -102,16 +93,9 @@ def _collected(
                 damage.check(path)
                 continue
             now = unwrapper.unwrap(int(stamp)) / 1000.0
-            time = now
-        elif math.isfinite(now):
-            time = now
-        else:
+        elif math.isnan(now):
             continue  # no firmware stamp yet, so no time
-        packets = found.setdefault((block, tuple(packet.names)), _Packets())
-        packets.time.append(time)
-        packets.order.append(order)
-        packets.host_time.append(host_time)
-        packets.values.append(packet.values)
+        found.setdefault((block, tuple(packet.names)), []).append((now, order, host_time, packet.values))
     damage.check(path)
     return found
 
@@ -149,15 +133,10 @@ def _packets(path: Path, header: Header, mapping: CsvMapping, damage: Damage) ->
         yield packet
 
 
-def _table(block: str, names: tuple[str, ...], packets: _Packets) -> Table:
-    values = np.array(packets.values, float)
-    return Table(
-        block,
-        {name: values[:, i] for i, name in enumerate(names)},
-        np.array(packets.time),
-        np.array(packets.order, np.int64),
-        np.array(packets.host_time),
-    )
+def _table(block: str, names: tuple[str, ...], packets: list[tuple[float, int, float, list[float]]]) -> Table:
+    time, order, host_time, values = zip(*packets, strict=True)
+    columns = dict(zip(names, np.array(values, float).T, strict=True))
+    return Table(block, columns, np.array(time), np.array(order, np.int64), np.array(host_time))
 
 
 def _with_host_signal(signals: dict[str, SignalArray], name: str, source: SignalColumns) -> dict[str, SignalArray]:

@@ -129,7 +129,7 @@ def load_mapping(text: str, where: str) -> CsvMapping:
     published = {n: _signal(n, _claimed(e), f"{where}: {key}.{n}", columns_key) for n, e in entries.items()}
     time = _get(table, "time", dict, where, {})
     _known(time, _TIME_KEYS, f"{where}: time")
-    columns = _texts(table, "columns", where)
+    columns = _entries(table, "columns", where)
     rate = _number(time, "rate_hz", f"{where}: time", math.nan)
     if layout == "long":
         for needed in ("host_time", "block", "stamp_ms", "name", "value"):
@@ -139,6 +139,7 @@ def load_mapping(text: str, where: str) -> CsvMapping:
     elif not (0.0 < rate < math.inf) or "column" in time:
         raise FileFormatError(f"{where}: time needs a column, or a positive rate_hz for rows without stamps.")
     name = _get(table, "name", str, where, Path(where).stem)
+    claims = _entries(table, "claims", where, (str, int, float, bool), "a number, a text, true or false")
     return CsvMapping(
         name=name,
         title=_get(table, "title", str, where, name),
@@ -153,9 +154,9 @@ def load_mapping(text: str, where: str) -> CsvMapping:
         published=published,
         rate=rate,
         clock=_get(time, "clock", str, f"{where}: time", ""),
-        units=_texts(table, "units", where),
+        units=_entries(table, "units", where),
         packets={p: _names(table["packets"], p, f"{where}: packets") for p in _get(table, "packets", dict, where, {})},
-        claims={k: str(v).lower() if isinstance(v, bool) else str(v) for k, v in _claims(table, where).items()},
+        claims={k: str(v).lower() if isinstance(v, bool) else str(v) for k, v in claims.items()},
     )
 
 
@@ -330,39 +331,28 @@ def _component_order(quantity: str, entry: Mapping[str, Any], count: int) -> lis
 def _frame(quantity: str, entry: Mapping[str, Any], where: str) -> tuple[str, tuple[str, str]]:
     """("body", "world", or "" for the frame of the signal; axes of body and world)."""
     words = _get(entry, "frame", str, where, "").replace("to", " ").replace(",", " ").split()
-    own = "body" if "body" in SIGNALS[quantity][2] else "world"
-    turns = quantity == "attitude" or quantity in _ANGLE_SIGNALS
-    frame, body, world = "", "FLU", "ENU"
-    for word in words:
-        if word in BODY_AXES:
-            body = word
-        elif word in WORLD_AXES:
-            world = word
-        elif word not in ("body", "world"):
-            known = ", ".join(("body", "world", *BODY_AXES, *WORLD_AXES))
-            raise FileFormatError(f'{where}.frame: unknown frame "{word}"; known are {known}.')
-        frame = "body" if word in ("body", *BODY_AXES) else "world"
-    if words and ("world" not in SIGNALS[quantity][2] and "body" not in SIGNALS[quantity][2]):
+    known = ("body", "world", *BODY_AXES, *WORLD_AXES)
+    unknown = next((word for word in words if word not in known), None)
+    if unknown is not None:
+        raise FileFormatError(f'{where}.frame: unknown frame "{unknown}"; known are {", ".join(known)}.')
+    ours = SIGNALS[quantity][2]
+    if words and "world" not in ours and "body" not in ours:
         raise FileFormatError(f"{where}.frame: {quantity} has no frame.")
-    if turns:
+    body = next((word for word in reversed(words) if word in BODY_AXES), "FLU")
+    world = next((word for word in reversed(words) if word in WORLD_AXES), "ENU")
+    if quantity == "attitude" or quantity in _ANGLE_SIGNALS:
         if (body == "FRD") != (world == "NED") and quantity != "attitude":
             raise FileFormatError(f'{where}.frame: angles are either "FLU to ENU" or "FRD to NED".')
         return "", (body, world)
-    if len({"body" if w in ("body", *BODY_AXES) else "world" for w in words}) > 1:
+    frames = {"body" if word in ("body", *BODY_AXES) else "world" for word in words}
+    if len(frames) > 1:
         raise FileFormatError(f"{where}.frame: {quantity} is given either in the body or in the world, not in both.")
-    if frame and frame != own and not quantity.startswith(("position", "setpoint_position", "wrench")):
-        return frame, (body, world)
-    if frame and frame != own:
+    own = "body" if "body" in ours else "world"
+    if frames <= {own}:
+        return "", (body, world)
+    if quantity.startswith(("position", "setpoint_position", "wrench")):
         raise FileFormatError(f"{where}.frame: {quantity} is given in the {own}, nothing else makes sense.")
-    return "", (body, world)
-
-
-def _claims(table: Mapping[str, Any], where: str) -> Mapping[str, Any]:
-    claims = _get(table, "claims", dict, where, {})
-    for key, value in claims.items():
-        if not isinstance(value, (str, int, float, bool)):
-            raise FileFormatError(f"{where}: claims.{key} must be a number, a text, true or false.")
-    return claims
+    return frames.pop(), (body, world)
 
 
 def _known(table: Mapping[str, Any], known: set[str], where: str) -> None:
@@ -392,12 +382,13 @@ def _names(table: Mapping[str, Any], key: str, where: str, default: Any = _REQUI
     return names
 
 
-def _texts(table: Mapping[str, Any], key: str, where: str) -> dict[str, str]:
-    texts = _get(table, key, dict, where, {})
-    for name, value in texts.items():
-        if not isinstance(value, str):
-            raise FileFormatError(f"{where}: {key}.{name} must be a text.")
-    return dict(texts)
+def _entries(table: Mapping[str, Any], key: str, where: str, kinds: Any = str, what: str = "a text") -> dict[str, Any]:
+    """The table below a key; all its values must be of certain types, which `what` names in the error."""
+    entries = _get(table, key, dict, where, {})
+    for name, value in entries.items():
+        if not isinstance(value, kinds):
+            raise FileFormatError(f"{where}: {key}.{name} must be {what}.")
+    return dict(entries)
 
 
 def _number(table: Mapping[str, Any], key: str, where: str, default: float | None) -> Any:

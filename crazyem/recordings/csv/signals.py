@@ -234,14 +234,13 @@ class _Kept:
     def _framed(value: Array, source: SignalColumns) -> Array:
         """Vectors and angles in FLU or ENU, from FRD or NED if necessary."""
         body, world = source.axes
-        if source.quantity.endswith("euler"):
-            if body == "FRD":
-                return value * [1.0, -1.0, -1.0] + [0.0, 0.0, 0.5 * math.pi]
-            return value
-        if value.shape[1] == 4 and body == "FRD":
+        if body == "FRD" and value.shape[1] == 4:
             return value * [-1.0, 1.0, -1.0, -1.0]  # thrust is positive upwards along the axis of the rotors
         if body == "FRD":
-            return value * [1.0, -1.0, -1.0]
+            turned = value * [1.0, -1.0, -1.0]
+            if source.quantity.endswith("euler"):
+                turned += [0.0, 0.0, 0.5 * math.pi]
+            return turned
         if world == "NED":
             return value[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
         return value

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -91,25 +91,11 @@ def read_wide_parts(
         blocks = [block for block in (before, part, after) if block]
         window = {c: np.concatenate([block[c] for block in blocks]) for c in part}
         lead = next(iter(before.values())).size if before else 0
-        total = next(iter(window.values())).size
-        stamp = _stamps(plan, window, total, number - lead)
-        yield _recording(
-            plan,
-            Rows(
-                stamp,
-                origin,
-                _named(plan, window),
-                (lead, lead + rows),
-                number,
-                starts=number - lead == 0,
-                ends=ends,
-                flown=flown,
-            ),
-            damage,
-            last=ends,
-        )
+        end, starts = lead + rows, number == lead
+        stamp = _stamps(plan, window, next(iter(window.values())).size, number - lead)
+        kept = Rows(stamp, origin, _named(plan, window), (lead, end), number, starts=starts, ends=ends, flown=flown)
+        yield _recording(plan, kept, damage, last=ends)
         number += rows
-        end = lead + rows
         before = {c: window[c][max(0, end - CONTEXT_ROWS) : end].copy() for c in window}
 
 
@@ -205,11 +191,8 @@ def _planned(path: Path, header: Header, mapping: CsvMapping, as_published: bool
         raise FileFormatError(f"{path}: the column {time}, which has the time, is missing.")
     stamp = at[time] if time else None
     if stamp is None:
-        notes.append(
-            note(
-                "mapping", f"There are no stamps; rows are taken to be {1.0 / mapping.rate:g} s apart.", Grade.DEGRADES
-            )
-        )
+        text = f"There are no stamps; rows are taken to be {1.0 / mapping.rate:g} s apart."
+        notes.append(note("mapping", text, Grade.DEGRADES))
     if header.repeated:
         notes.append(note("mapping", f"Columns occur more than once: {_some(header.repeated)}; the first one counts."))
     needed = dict.fromkeys(([] if stamp is None else [stamp]) + [at[c] for s in signals.values() for c in s.columns])
@@ -238,7 +221,7 @@ def _planned(path: Path, header: Header, mapping: CsvMapping, as_published: bool
 def _recording(plan: _Plan, rows: Rows, damage: Damage, *, last: bool) -> Recording:
     start = float(rows.stamp[rows.keep[0]]) if plan.stamp is not None else math.nan
     signals, findings = signals_of(plan.layout, rows)
-    notes = (*plan.notes, *_noted(plan, damage)) if last else plan.notes
+    notes = (*plan.notes, *damage_notes(damage, plan.header.names)) if last else plan.notes
     metadata = {
         "csv": {
             "mapping": plan.mapping.name,
@@ -254,17 +237,8 @@ def _recording(plan: _Plan, rows: Rows, damage: Damage, *, last: bool) -> Record
     )
 
 
-def _noted(plan: _Plan, damage: Damage) -> list[Finding]:
-    """Findings about the text of the file."""
-    notes = damage_notes(damage)
-    for column, count in damage.words.items():
-        name = plan.header.names[column]
-        notes.append(note("integrity", f"{count} values in column {name} are no numbers.", count=float(count)))
-    return notes
-
-
-def damage_notes(damage: Damage) -> list[Finding]:
-    """Findings about damaged lines of a file."""
+def damage_notes(damage: Damage, names: Sequence[str] = ()) -> list[Finding]:
+    """Findings about damaged lines and fields of a file whose columns have these names."""
     notes = []
     if damage.dropped:
         where = ", ".join(map(str, damage.lines)) + (", ..." if damage.dropped > len(damage.lines) else "")
@@ -275,9 +249,11 @@ def damage_notes(damage: Damage) -> list[Finding]:
         notes.append(note("integrity", text, Grade.DEGRADES))
     if damage.cut_line and not damage.cut_gzip:
         notes.append(note("integrity", "The last line is cut short and was dropped."))
+    for column, count in damage.words.items():
+        notes.append(note("integrity", f"{count} values in column {names[column]} are no numbers.", count=float(count)))
     return notes
 
 
-def _some(names: tuple[str, ...] | list[str]) -> str:
+def _some(names: Sequence[str]) -> str:
     shown = ", ".join(name[:40] for name in names[:8])
     return shown + (f" and {len(names) - 8} more" if len(names) > 8 else "")
