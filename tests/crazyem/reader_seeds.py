@@ -6,37 +6,26 @@ import random
 import struct
 from pathlib import Path
 
-import numpy as np
-
 INTERESTING = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 2**63 - 1, 2**64 - 1)
 
 
 def seeds(folder: Path) -> dict[str, bytes]:
     """Format -> bytes of a small valid file. `folder` is for scratch files."""
     from test_recordings_cfclient import STATE, as_cfclient, rows_of
+    from test_recordings_csv import rows, text
     from test_recordings_tlog import flight as tlog
     from test_recordings_ulog import flight as ulog
     from test_recordings_usd import small_log
 
+    nanobench = text(rows(12)).encode()
     return {
         "usd1": small_log(1)[2], "usd2": small_log(2)[2], "ulog": ulog(rows=6)[0], "tlog": tlog(rows=4)[0],
         "cfclient": as_cfclient(STATE, rows_of(STATE)).encode(),
-        "nanobench": _nanobench(),
-        "nanobench.gz": gzip.compress(_nanobench(), mtime=0),
-        "long": _long(), "mcap": _ours(folder / "ours.mcap"), "imported": _imported(folder),
-        "exported": _exported(folder), "rosbag2": _rosbag2(folder / "bag.mcap"),
+        "nanobench": nanobench,
+        "nanobench.gz": gzip.compress(nanobench, mtime=0),
+        "long": _long(), "mcap": _ours(folder / "ours.mcap"), "imported": _imported(folder, nanobench),
+        "exported": _exported(folder, nanobench), "rosbag2": _rosbag2(folder / "bag.mcap"),
     }  # fmt: skip
-
-
-def _nanobench() -> bytes:
-    names = ["t", "px", "py", "pz", "qx", "qy", "qz", "qw", "vx", "vy", "vz"]
-    names += [f"{what}_{axis}" for what in ("imu_acc", "imu_gyro") for axis in "xyz"]
-    names += ["wx_vicon", "wy_vicon", "wz_vicon", *(f"motor_motor_m{i}" for i in range(1, 5)), "pwr_pm_vbat"]
-    rng = np.random.default_rng(4)
-    rows = rng.normal(size=(12, len(names)))
-    rows[:, 0] = 1.7e9 + 0.01 * np.arange(12)
-    lines = [",".join(names), *(",".join(f"{v:.9f}" for v in row) for row in rows)]
-    return ("\n".join(lines) + "\n").encode()
 
 
 def _long() -> bytes:
@@ -61,22 +50,22 @@ def _ours(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def _imported(folder: Path) -> bytes:
+def _imported(folder: Path, content: bytes) -> bytes:
     from crazyem.recordings import open_recording
     from crazyem.recordings.mcap.signals import write_recording
 
     source, target = folder / "seed.csv", folder / "imported.mcap"
-    source.write_bytes(_nanobench())
+    source.write_bytes(content)
     target.unlink(missing_ok=True)
     write_recording(open_recording(source), target)
     return target.read_bytes()
 
 
-def _exported(folder: Path) -> bytes:
+def _exported(folder: Path, content: bytes) -> bytes:
     from crazyem.cli import main
 
     source, target = folder / "seed.csv", folder / "exported.csv"
-    source.write_bytes(_nanobench())
+    source.write_bytes(content)
     assert main(["export", str(source), "-o", str(target), "--force"]) == 0
     return target.read_bytes()
 
@@ -84,34 +73,24 @@ def _exported(folder: Path) -> bytes:
 def _rosbag2(path: Path) -> bytes:
     from mcap_ros2.writer import Writer
 
-    text = "float64 x\nfloat64 y\nfloat64 z\n"
-    definition = (
-        "std_msgs/Header header\ngeometry_msgs/Pose pose\n"
-        + "=" * 80
-        + "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
-        + "=" * 80
-        + "\nMSG: geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
-        + "=" * 80
-        + "\nMSG: geometry_msgs/Point\n"
-        + text
-        + "=" * 80
-        + "\nMSG: geometry_msgs/Quaternion\n"
-        + text
-        + "float64 w\n"
-    )
+    vector = "float64 x\nfloat64 y\nfloat64 z\n"
+    parts = {
+        "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+        "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
+        "geometry_msgs/Point": vector,
+        "geometry_msgs/Quaternion": f"{vector}float64 w\n",
+    }
+    definition = "std_msgs/Header header\ngeometry_msgs/Pose pose\n"
+    definition += "".join(f"{'=' * 80}\nMSG: {name}\n{text}" for name, text in parts.items())
     stream = io.BytesIO()
     writer = Writer(stream)
     schema = writer.register_msgdef("geometry_msgs/msg/PoseStamped", definition)
     for i in range(10):
         stamp = {"sec": 1_700_000_000, "nanosec": 10_000_000 * i}
         pose = {"position": {"x": 0.1 * i, "y": 0.0, "z": 1.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
-        writer.write_message(
-            topic="/cf1/pose",
-            schema=schema,
-            message={"header": {"stamp": stamp, "frame_id": "world"}, "pose": pose},
-            log_time=10**9 * 1_700_000_000 + 10_000_000 * i,
-            publish_time=10**9 * 1_700_000_000 + 10_000_000 * i,
-        )
+        message = {"header": {"stamp": stamp, "frame_id": "world"}, "pose": pose}
+        time = 10**9 * 1_700_000_000 + 10_000_000 * i
+        writer.write_message("/cf1/pose", schema, message, log_time=time, publish_time=time)
     writer.finish()
     return stream.getvalue()
 

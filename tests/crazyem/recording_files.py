@@ -1,16 +1,20 @@
-"""Recordings on disk for the tests of commands, and how these run a command."""
+"""Recordings on disk for tests, how tests of commands run one, and recordings in parts against the whole."""
 
 import os
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from made_flight import made_flight
 
 from crazyem.cli import main
-from crazyem.recordings import Recording
+from crazyem.recordings import Recording, SignalArray
 from crazyem.recordings.export import export
+
+ARRAYS = ("time", "value", "order", "host_time", "marked")
 
 
 def save(recording: Recording, path: Path) -> Path:
@@ -63,6 +67,23 @@ def fails(capsys: pytest.CaptureFixture[str], *argv: object, code: int) -> str:
     return lines[0]
 
 
-def cut(array: Any, later: bool) -> Any:
-    rows = (array.time >= 10.0) == later
-    return replace(array, **{f: getattr(array, f)[rows] for f in ("time", "value", "order", "host_time", "marked")})
+def joined(parts: list[Recording]) -> dict[str, SignalArray]:
+    """The signals of consecutive parts as those of one recording."""
+    signals: dict[str, SignalArray] = {}
+    for name in dict.fromkeys(name for part in parts for name in part.signals):
+        pieces = [part.signals[name] for part in parts if name in part.signals]
+        arrays: dict[str, Any] = {f: np.concatenate([getattr(p, f) for p in pieces]) for f in ARRAYS}
+        signals[name] = replace(pieces[0], **arrays)
+    return signals
+
+
+def assert_same_signals(one: Mapping[str, SignalArray], other: Mapping[str, SignalArray]) -> None:
+    """Equal in all, arrays to the last bit."""
+    assert list(one) == list(other)
+    for name, array in one.items():
+        for field in fields(SignalArray):
+            a, b = getattr(array, field.name), getattr(other[name], field.name)
+            if field.name in ARRAYS:
+                assert a.dtype == b.dtype
+                a, b = a.tobytes(), b.tobytes()
+            assert a == b, (name, field.name)

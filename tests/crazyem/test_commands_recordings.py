@@ -1,8 +1,6 @@
 """Commands on recordings: which files, what is said, what is made of them."""
 
 import json
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +8,24 @@ import numpy as np
 import pandas as pd
 import pytest
 from made_flight import Motion, changed, made_flight
-from recording_files import cut, fails, flight_fixture, folder_fixture, link_pair, run, save
+from recording_files import fails, flight_fixture, folder_fixture, link_pair, run, save
 
+from crazyem.cli import parser
 from crazyem.commands import files
-from crazyem.commands.merge import merge_findings, merge_inventories
-from crazyem.doctor.inventory import inventory
+from crazyem.commands.merge import merge_findings
 from crazyem.errors import UsageError
-from crazyem.recordings import Finding, Grade, open_recording
+from crazyem.recordings import Finding, Grade, ReadOptions, open_recording
 from crazyem.recordings.mcap.signals import write_recording
 
 flight = pytest.fixture(scope="module")(flight_fixture)
 folder = pytest.fixture(folder_fixture)
+
+
+def json_of(capsys: pytest.CaptureFixture[str], *argv: object, code: int = 0) -> Any:
+    """Run with --json, expect this exit code; return the JSON."""
+    got, out, _ = run(capsys, *argv, "--json")
+    assert got == code
+    return json.loads(out)
 
 
 # --- what is found ------------------------------------------------------------------------------------------------
@@ -77,16 +82,12 @@ def test_info_of_one(capsys: pytest.CaptureFixture[str], flight: Path) -> None:
     assert (code, err) == (0, "")
     assert "position" in out
     assert "what it could identify" in out
-
-
-def test_json_alone_is_all_of_standard_output(capsys: pytest.CaptureFixture[str], flight: Path) -> None:
-    code, out, err = run(capsys, "info", flight, "--json")
-    told = json.loads(out)["files"]
+    code, out, err = run(capsys, "info", flight, "--json")  # JSON alone is all of standard output
+    (found,) = json.loads(out)["files"]
     assert (code, err) == (0, "")
-    assert [t["file"] for t in told] == [str(flight)]
-    assert told[0]["duration_s"] == pytest.approx(8.0, abs=0.02)
-    signals = {s["name"]: s for s in told[0]["signals"]}
-    assert signals["body_rate"]["unit"] == "rad/s"
+    assert found["file"] == str(flight)
+    assert found["duration_s"] == pytest.approx(8.0, abs=0.02)
+    assert {s["name"]: s["unit"] for s in found["signals"]}["body_rate"] == "rad/s"
 
 
 def test_one_that_fails_does_not_stop_the_others(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
@@ -96,10 +97,10 @@ def test_one_that_fails_does_not_stop_the_others(capsys: pytest.CaptureFixture[s
     assert err.count("crazyem: ") == 1
     assert "broken.csv" in err
     assert "3 recordings, 1 could not be read, 7 other files skipped" in out
-    told = json.loads(summary.read_text())
-    assert [bool(f.get("error")) for f in told["files"]] == [False, False, True, False]
-    assert told["files"][2]["exit_code"] == 3
-    assert told["skipped_files"] == 7
+    whole = json.loads(summary.read_text())
+    assert [bool(f.get("error")) for f in whole["files"]] == [False, False, True, False]
+    assert whole["files"][2]["exit_code"] == 3
+    assert whole["skipped_files"] == 7
 
 
 def test_a_single_unreadable_file_is_one_sentence(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
@@ -117,23 +118,15 @@ def test_json_does_not_replace_a_recording(capsys: pytest.CaptureFixture[str], f
 
 def test_options_of_reading_reach_the_reader(capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path) -> None:
     assert "--motor" in fails(capsys, "info", flight, "--motor", "both", code=2)
-    given = []
-    for argv in (["info", "f", "--motor", "request", "--as-published", "--map", "m.toml"], ["replay", "f"]):
-        from crazyem.cli import parser
-
-        given.append(files.read_options(parser().parse_args(argv)))
-    assert (given[0].mapping, given[0].motor, given[0].as_published) == ("m.toml", "request", True)
-    assert (given[1].mapping, given[1].motor, given[1].as_published) == (None, None, False)
+    given = ["--motor", "request", "--as-published", "--map", "m.toml", "--from", "1", "--to", "2"]
+    options = files.read_options(parser().parse_args(["replay", "f", *given]))
+    assert options == ReadOptions("m.toml", "request", as_published=True, start=1.0, end=2.0)
+    assert files.read_options(parser().parse_args(["replay", "f"])) == ReadOptions()
 
 
 def test_info_in_parts_says_what_the_whole_says(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = save(made_flight(seconds=150.0, more=["rpm"]), tmp_path / "long.csv")
-    told = []
-    for more in ([], ["--parts"]):
-        code, out, _ = run(capsys, "info", path, "--json", *more)
-        assert code == 0
-        told.append(json.loads(out)["files"][0])
-    whole, parts = told
+    whole, parts = (json_of(capsys, "info", path, *more)["files"][0] for more in ([], ["--parts"]))
     assert parts["duration_s"] == pytest.approx(whole["duration_s"])
     assert parts["samples"] == whole["samples"]
     for a, b in zip(whole["signals"], parts["signals"], strict=True):
@@ -143,18 +136,6 @@ def test_info_in_parts_says_what_the_whole_says(capsys: pytest.CaptureFixture[st
         assert a["longest_gap_s"] == pytest.approx(b["longest_gap_s"])
     for key in ("speed_max_m_s", "altitude_max_m", "tilt_max_deg", "motor_command_max"):
         assert parts["envelope"][key] == pytest.approx(whole["envelope"][key], rel=1e-6), key
-
-
-def test_inventories_of_parts_add_up() -> None:
-    recording = made_flight(seconds=20.0)
-    halves = [
-        replace(recording, signals={n: cut(a, half) for n, a in recording.signals.items()}) for half in (False, True)
-    ]
-    whole, merged = inventory(recording), merge_inventories(inventory(h) for h in halves)
-    assert merged.samples == whole.samples
-    for a, b in zip(whole.signals, merged.signals, strict=True):
-        assert (a.name, a.samples, a.start_s, a.end_s, a.rate_hz) == (b.name, b.samples, b.start_s, b.end_s, b.rate_hz)
-        assert a.longest_gap_s == pytest.approx(b.longest_gap_s)
 
 
 def test_findings_of_parts_become_one() -> None:
@@ -187,11 +168,9 @@ def test_doctor_names_grades_and_advises(capsys: pytest.CaptureFixture[str], in_
     assert "UNUSABLE  rates body_rate" in out
     assert "evidence: " in out
     assert "advice: " in out
-    code, out, _ = run(capsys, "doctor", in_degrees, "--strict", "--json")
-    assert code == 5
-    told = json.loads(out)["files"][0]
-    assert told["grade"] == "unusable"
-    assert any(f["check"] == "rates" and f["fix"]["kind"] == "scale" for f in told["findings"] if f["fix"])
+    (found,) = json_of(capsys, "doctor", in_degrees, "--strict", code=5)["files"]
+    assert found["grade"] == "unusable"
+    assert any(f["check"] == "rates" and f["fix"]["kind"] == "scale" for f in found["findings"] if f["fix"])
 
 
 def test_fix_writes_a_new_file_that_is_cured(
@@ -205,8 +184,7 @@ def test_fix_writes_a_new_file_that_is_cured(
     assert in_degrees.read_bytes() == before
     repaired = open_recording(target).signals["body_rate"].value
     assert repaired == pytest.approx(np.radians(open_recording(in_degrees).signals["body_rate"].value), rel=1e-2)
-    code, out, _ = run(capsys, "doctor", target, "--json")
-    assert not any(f["check"] == "rates" for f in json.loads(out)["files"][0]["findings"])
+    assert not any(f["check"] == "rates" for f in json_of(capsys, "doctor", target)["files"][0]["findings"])
     assert "exists already" in fails(capsys, "doctor", in_degrees, "--fix", "-o", target, code=2)
 
 
@@ -224,9 +202,7 @@ def test_fix_goes_beside_the_recording_and_never_onto_it(
 
 def test_what_is_sound_is_not_rewritten(capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path) -> None:
     target = tmp_path / "new.mcap"
-    code, out, _ = run(capsys, "doctor", flight, "--fix", "-o", target, "--json")
-    fixed = json.loads(out)["files"][0]["fixed"]
-    assert code == 0
+    fixed = json_of(capsys, "doctor", flight, "--fix", "-o", target)["files"][0]["fixed"]
     assert fixed["applied"] == []
     assert fixed["output"] is None
     assert not target.exists()
@@ -235,21 +211,11 @@ def test_what_is_sound_is_not_rewritten(capsys: pytest.CaptureFixture[str], flig
 def test_copies_among_several_are_told(capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path) -> None:
     link_pair(flight, tmp_path / "copy.csv")
     save(made_flight(seconds=8.0, seed=5), tmp_path / "other.csv")
-    code, out, _ = run(capsys, "doctor", flight, tmp_path, "--jobs", 1, "--json")
-    assert code == 0
-    told = json.loads(out)["duplicates"]
-    assert len(told) == 1
-    assert {"flight.csv", "copy.csv"} <= {Path(w).name for w in words(told[0])}
-    assert "other.csv" not in {Path(w).name for w in words(told[0])}
-
-
-def words(value: Any) -> Iterator[str]:
-    """Every string in a JSON value."""
-    if isinstance(value, dict | list):
-        for item in value.values() if isinstance(value, dict) else value:
-            yield from words(item)
-    elif isinstance(value, str):
-        yield value
+    (pair,) = json_of(capsys, "doctor", flight, tmp_path, "--jobs", 1)["duplicates"]
+    text = json.dumps(pair)
+    assert "flight.csv" in text
+    assert "copy.csv" in text
+    assert "other.csv" not in text
 
 
 # --- import, export -----------------------------------------------------------------------------------------------
@@ -258,16 +224,14 @@ def words(value: Any) -> Iterator[str]:
 def test_import_then_export_loses_nothing(capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path) -> None:
     mcap, table = tmp_path / "f.mcap", tmp_path / "again.csv"
     assert run(capsys, "import", flight, "-o", mcap)[0] == 0
-    code, out, _ = run(capsys, "export", mcap, "-o", table, "--json")
-    assert code == 0
-    assert json.loads(out)["files"][0]["output"] == [str(table), f"{table}-metadata.json"]
-    a, b = open_recording(flight), open_recording(table)
-    for name, array in a.signals.items():
+    made = json_of(capsys, "export", mcap, "-o", table)["files"][0]
+    assert made["output"] == [str(table), f"{table}-metadata.json"]
+    a, b = open_recording(flight).signals, open_recording(table).signals
+    for name, array in a.items():
         for field in ("time", "value", "host_time", "marked"):
-            assert np.array_equal(getattr(array, field), getattr(b.signals[name], field), equal_nan=field != "marked")
-        assert (array.unit, array.frame, array.clock, array.stream) == (
-            b.signals[name].unit, b.signals[name].frame, b.signals[name].clock, b.signals[name].stream,
-        )  # fmt: skip
+            np.testing.assert_array_equal(getattr(array, field), getattr(b[name], field))
+        for field in ("unit", "frame", "clock", "stream"):
+            assert getattr(array, field) == getattr(b[name], field)
     assert run(capsys, "export", mcap, "-o", tmp_path / "f.parquet")[0] == 0
     assert pd.read_parquet(tmp_path / "f.parquet").attrs["units"]["voltage"] == "V"
 
@@ -336,10 +300,7 @@ def test_recover_a_cut_recording(capsys: pytest.CaptureFixture[str], tmp_path: P
     whole, broken, target = tmp_path / "w.mcap", tmp_path / "b.mcap", tmp_path / "r.mcap"
     write_recording(made_flight(seconds=60.0), whole)
     broken.write_bytes(whole.read_bytes()[: whole.stat().st_size * 2 // 3])
-    code, out, _ = run(capsys, "recover", broken, "-o", target, "--json")
-    told = json.loads(out)["files"][0]
-    assert code == 0
-    assert told["messages"] > 0
+    assert json_of(capsys, "recover", broken, "-o", target)["files"][0]["messages"] > 0
     a, b = open_recording(whole).signals["body_rate"], open_recording(target).signals["body_rate"]
     assert 0 < b.time.size < a.time.size
     assert np.array_equal(a.value[: b.time.size], b.value)

@@ -54,8 +54,6 @@ def test_a_reader_that_has_seen_enough(flight: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "crazyem", "info", str(flight)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
-    assert process.stdout is not None
-    assert process.stderr is not None
     process.stdout.close()
     said = process.stderr.read()
     process.stderr.close()
@@ -71,7 +69,6 @@ def test_interrupted_among_many(tmp_path: Path, flight: Path) -> None:
         [sys.executable, "-m", "crazyem", "info", str(tmp_path), "--jobs", "2"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
     )  # fmt: skip
-    assert process.stdout is not None
     process.stdout.readline()  # it has begun
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all of its processes
     _, err = process.communicate(timeout=600)

@@ -146,9 +146,6 @@ def test_airborne_needs_no_particular_signal() -> None:
         air = airtime(left)
         assert air.judged_by == by
         assert air.flown[0] == pytest.approx(whole, abs=0.8)  # rotors turn before it is 3 cm up
-    nothing = airtime(without(made, "position", "motor_command", "rotor_speed", "flying"))
-    assert nothing.judged_by == ()
-    assert nothing.seconds == pytest.approx(20.0, abs=0.05)
 
 
 def test_two_hops_are_two_stretches_and_a_short_dip_of_the_rotors_is_none() -> None:
@@ -197,11 +194,8 @@ def test_excitation_makes_inertia_known_and_hover_does_not() -> None:
         assert excited[name].verdict == "yes", excited[name]
     for name, truth in zip(("Ixx", "Iyy", "Izz"), TRUTH.inertia):
         large, small = hover[name].relative_sd, excited[name].relative_sd
-        assert small is not None
-        assert large is not None
         assert large > 3.0 * small
         value = hover[name].value
-        assert value is not None
         assert abs(math.log(value / truth)) < 3.0 * large
     assert hover["mass"].verdict == "yes"  # weight is enough
     assert excited["battery_law"].verdict == "no"
@@ -214,11 +208,8 @@ def test_the_expected_errors_are_the_real_ones() -> None:
     for seed in range(10):
         made = recorded(TRUTH, seed=seed, duration=10.0)
         inputs, gyro = inputs_of(made, DRONE), made.signals["body_rate"]
-        assert not isinstance(inputs, str)
         steps = steps_of(gyro.time, gyro.value, airtime(made))
-        assert steps is not None
         fit = rotation_fit(inputs, steps, DRONE)
-        assert fit is not None
         errors.append([(fit.value[i] - truth[i]) / fit.total(i) for i in range(4)])
         assert np.all(fit.sd[:4] < 0.1)
     rms = np.sqrt(np.mean(np.square(errors), axis=0))
@@ -229,9 +220,6 @@ def test_the_expected_errors_are_the_real_ones() -> None:
 def test_a_longer_flight_knows_more_but_the_window_does_not() -> None:
     short = verdicts(inventory(recorded(TRUTH, seed=3, duration=10.0), DRONE))["mass"]
     long = verdicts(inventory(recorded(TRUTH, seed=3, duration=40.0), DRONE))["mass"]
-    assert short.relative_sd is not None
-    assert long.relative_sd is not None
-    assert long.window_relative_sd is not None
     assert long.relative_sd < 0.8 * short.relative_sd
     assert long.window_relative_sd > 1.5 * long.relative_sd
 
@@ -261,7 +249,6 @@ def test_drag_and_mass_are_those_of_the_flight() -> None:
     assert mass.verdict == drag.verdict == "yes"
     assert drag.value == pytest.approx(0.3, rel=0.05)
     assert mass.value == pytest.approx(0.036, rel=0.02)
-    assert mass.relative_sd is not None
     assert mass.relative_sd < 0.01
 
 
@@ -276,8 +263,6 @@ def test_the_shipped_flight_identifies_all() -> None:
     truth = {"mass": 0.036, "Ixx": 20e-6, "Iyy": 21e-6, "Izz": 36e-6, "motor_time_constant": 0.06}
     for name, value in truth.items():
         verdict = found[name]
-        assert verdict.value is not None
-        assert verdict.sd is not None
         assert abs(verdict.value - value) < 3.0 * verdict.sd, verdict
 
 
@@ -299,8 +284,6 @@ def test_the_real_firmware_gives_mass_but_not_roll_and_pitch_inertia(
     # what it says may be off does contain the truth
     for axis, value in {"Ixx": 1.657171e-5, "Iyy": 1.6655602e-5, "Izz": 2.9261652e-5}.items():
         verdict = found[axis]
-        assert verdict.value is not None
-        assert verdict.relative_sd is not None
         assert abs(math.log(verdict.value / value)) < 2.0 * verdict.relative_sd
 
 
@@ -309,7 +292,6 @@ def test_nanobench_gives_a_mass_ratio_and_no_inertia(shared_recordings: Path) ->
     found = verdicts(inventory(recording, load_vehicle("cf2")))
     assert found["mass"].verdict == "yes"
     assert "ratio" in found["mass"].reason
-    assert found["mass"].value is not None
     assert 1.55 < found["mass"].value / 0.027 < 1.75
     assert [found[axis].verdict for axis in ("Ixx", "Iyy", "Izz")] == ["no"] * 3
 

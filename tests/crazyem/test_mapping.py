@@ -322,19 +322,8 @@ def test_mappings_that_do_not_fit_the_file(tmp_path):
 def test_no_value_of_any_key_breaks_the_loader(value):
     source = {"nan": "nan", "inf": "inf", "-inf": "-inf", "True": "true", "False": "false"}
     text = source.get(repr(value)) or repr(value)
-    for key in (
-        "columns",
-        "unit",
-        "sign",
-        "scale",
-        "order",
-        "frame",
-        "missing",
-        "above",
-        "hold",
-        "rotors",
-        "published",
-    ):
+    keys = ("columns", "unit", "sign", "scale", "order", "frame", "missing", "above", "hold", "rotors", "published")
+    for key in keys:
         with contextlib.suppress(FileFormatError):
             load_mapping(f'[time]\ncolumn="t"\n[signals.voltage]\ncolumns=["v"]\n{key} = {text}\n', "mine.toml")
 

@@ -24,13 +24,8 @@ WRAP = 1 << 24
 
 def as_cfclient(variables, rows):
     """What the LogWriter of cfclient writes: the stamp as an integer, str() of each value."""
-    text = ",".join(("Timestamp", *variables)) + "\n"
-    for stamp, *values in rows:
-        text += str(stamp % WRAP)
-        for value in values:
-            text += "," + str(value)
-        text += "\n"
-    return text
+    lines = [("Timestamp", *variables), *((stamp % WRAP, *values) for stamp, *values in rows)]
+    return "".join(",".join(map(str, line)) + "\n" for line in lines)
 
 
 def single(value):

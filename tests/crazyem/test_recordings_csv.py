@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from recording_files import assert_same_signals, joined
 
 from crazyem.errors import CrazyemError, DataError, FileFormatError
 from crazyem.recordings import open_recording
@@ -23,11 +24,6 @@ NANOBENCH = [
     *(f"motor_motor_m{i}" for i in (1, 2, 3, 4)),
     "pwr_pm_vbat",
 ]
-LONG = "host_t,block,fw_ms,name,value\n" + "".join(
-    f"{1.79e9 + 0.01 * k},imu,{10 * k},{name},{k % 7}\n"
-    for k in range(30)
-    for name in ("gyro.x", "gyro.y", "gyro.z", "motor.m1", "motor.m2", "motor.m3", "motor.m4")
-)
 REQUIRED = ("position", "velocity", "attitude", "body_rate", "specific_force", "motor_command", "voltage")
 
 
@@ -45,15 +41,13 @@ def text(table, header=NANOBENCH):
 
 def put(folder, content, name="flight.csv"):
     path = folder / name
-    path.write_text(content)
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
     return path
 
 
 def test_units_and_order(tmp_path):
     table = rows(20)
-    path = tmp_path / "flight.csv.gz"
-    path.write_bytes(gzip.compress(text(table).encode()))
-    recording = open_recording(path)
+    recording = open_recording(put(tmp_path, gzip.compress(text(table).encode()), "flight.csv.gz"))
     recording.check(REQUIRED)
     assert recording.source == "csv:nanobench"
     column = {name: table[:, i] for i, name in enumerate(NANOBENCH)}
@@ -121,20 +115,13 @@ def test_empty_fields_are_nan_and_a_cut_line_is_dropped(tmp_path):
         ("host_t,block,fw_ms,name,value\n1,ref,0,ref.x,1\n", "not a single sample"),
         ("hello world\n", "is not a recording"),
         ("", "is empty"),
+        (gzip.compress(text(rows(200)).encode())[:10_000], "gzip"),
     ],
 )
 def test_files_that_are_something_else(tmp_path, content, message):
     with pytest.raises(FileFormatError, match=message) as caught:
         open_recording(put(tmp_path, content))
     assert "flight.csv" in str(caught.value)
-
-
-def test_a_cut_gzip_file_is_one_sentence(tmp_path):
-    packed = gzip.compress(text(rows(200)).encode())
-    path = tmp_path / "flight.csv.gz"
-    path.write_bytes(packed[: len(packed) // 2])
-    with pytest.raises(FileFormatError, match="gzip"):
-        open_recording(path)
 
 
 @given(content=st.text(alphabet="0123456789.,-enai\n \x00é", max_size=200), head=st.integers(0, 1))
@@ -192,25 +179,21 @@ hold = 0.5
 NAMES = ["t", "x", "y", "z", "p", "q", "r", "v", "extra"]
 
 
-def plain(content, delimiter=","):
+def plain(content):
     """Columns of a sound CSV by the standard library: what the reader must agree with."""
-    lines = list(csv.DictReader(io.StringIO(content), delimiter=delimiter))
+    lines = list(csv.DictReader(io.StringIO(content)))
     return {name: np.array([float(line[name] or "nan") for line in lines]) for name in lines[0]}
 
 
-def mine(folder, content, **options):
+def mine(folder, content):
     (folder / "mine.toml").write_text(MINE)
-    path = folder / "flight.csv"
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path, ReadOptions(mapping=str(folder / "mine.toml"), **options)
+    return put(folder, content), ReadOptions(mapping=str(folder / "mine.toml"))
 
 
-def table_text(count, seed=0, delimiter=",", end="\n"):
-    rng = np.random.default_rng(seed)
-    table = rng.normal(size=(count, len(NAMES)))
+def table_text(count):
+    table = np.random.default_rng(0).normal(size=(count, len(NAMES)))
     table[:, 0] = 1e3 + 0.01 * np.arange(count)
-    lines = [delimiter.join(NAMES), *(delimiter.join(map(repr, row)) for row in table.tolist())]
-    return end.join(lines) + end
+    return text(table, NAMES)
 
 
 @given(
@@ -320,20 +303,9 @@ def test_rows_without_stamps_need_a_rate(tmp_path):
 # --- parts -----------------------------------------------------------------------------------------------------------
 
 
-def joined(parts):
-    """Signals of several parts, put together."""
-    fields = ("time", "value", "order", "host_time", "marked")
-    return {
-        name: {f: np.concatenate([getattr(p.signals[name], f) for p in parts]) for f in fields}
-        for name in parts[0].signals
-    }
-
-
 def same(parts, whole):
     assert {p.origin for p in parts} == {whole.origin}
-    for name, arrays in joined(parts).items():
-        for key, array in arrays.items():
-            assert np.array_equal(array, getattr(whole.signals[name], key), equal_nan=array.dtype.kind == "f"), name
+    assert_same_signals(joined(parts), whole.signals)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.05, 3.0))
@@ -348,8 +320,7 @@ def test_parts_joined_are_the_whole(tmp_path_factory, seed, seconds):
             ends = [gap.start, min(gap.stop, count - 1)]
             table[gap, c] = np.interp(table[gap, 0], table[ends, 0], table[ends, c])
     table[:, 7] = np.interp(table[:, 0], np.arange(0, 20, 0.1), 4 + rng.normal(0, 0.01, 200))
-    content = ",".join(NAMES) + "\n" + "".join(",".join(f"{v:.9f}" for v in row) + "\n" for row in table)
-    path, options = mine(tmp_path_factory.getbasetemp(), content)
+    path, options = mine(tmp_path_factory.getbasetemp(), text(table, NAMES))
     whole = csv_file.read(path, options)
     parts = list(csv_file.read_parts(path, options, seconds))
     assert len(parts) >= min(2, int((table[-1, 0] - table[0, 0]) / seconds))

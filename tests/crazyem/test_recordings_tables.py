@@ -8,6 +8,7 @@ from crazyem.recordings.tables import Table, signals_from_tables
 from crazyem.signals.firmware_units import unit_of
 
 N = 6
+MOTOR, PWM = [f"motor.m{i}" for i in (1, 2, 3, 4)], [f"pwm.m{i}_pwm" for i in (1, 2, 3, 4)]
 
 
 def table(name, names, *, start=0, values=None, host=None, dtype=np.float32):
@@ -50,19 +51,18 @@ def test_tables_of_one_name_lose_nothing():
 
 
 @pytest.mark.parametrize(
-    ("motor", "expected"),
-    [("duty", {"motor_command"}), ("request", {"motor_request"}), (None, {f"motor.m{i}" for i in (1, 2, 3, 4)})],
+    ("motor", "signals", "with_pwm"),
+    [
+        ("duty", {"motor_command"}, {"motor_command", *MOTOR}),
+        ("request", {"motor_request"}, {"motor_command", "motor_request"}),
+        (None, set(MOTOR), {"motor_command", *MOTOR}),
+    ],
 )
-def test_motor_as_told(motor, expected):
-    assert set(signals_from_tables([table("a", [f"motor.m{i}" for i in (1, 2, 3, 4)])], motor=motor)) == expected
-
-
-def test_pwm_is_the_command_whatever_motor_is():
-    names = [f"motor.m{i}" for i in (1, 2, 3, 4)] + [f"pwm.m{i}_pwm" for i in (1, 2, 3, 4)]
-    for motor, more in (("duty", "motor.m1"), ("request", "motor_request"), (None, "motor.m1")):
-        signals = signals_from_tables([table("a", names)], motor=motor)
-        assert signals["motor_command"].source[0] == "pwm.m1_pwm"
-        assert more in signals
+def test_motor_is_as_told_and_pwm_is_the_command_in_any_case(motor, signals, with_pwm):
+    assert set(signals_from_tables([table("a", MOTOR)], motor=motor)) == signals
+    found = signals_from_tables([table("a", [*MOTOR, *PWM])], motor=motor)
+    assert set(found) == with_pwm
+    assert found["motor_command"].source[0] == "pwm.m1_pwm"
 
 
 def test_samples_come_in_the_order_of_the_rows():
@@ -86,21 +86,16 @@ def test_only_a_nan_of_ours_is_marked():
     assert signal.marked.tolist() == [False, True, False, False, False, False]
 
 
-def test_what_a_table_has_in_common_is_held_once():
-    signals = signals_from_tables([table("a", [*gyro(), "x.y", "x.z"])], motor=None)
+@pytest.mark.parametrize("host", [None, 1.7e9 + np.arange(N)])
+def test_what_a_table_has_in_common_is_held_once(host):
+    signals = signals_from_tables([table("a", [*gyro(), "x.y", "x.z"], host=host)], motor=None)
     a, b, c = signals["body_rate"], signals["x.y"], signals["x.z"]
     for other in (b, c):
         assert other.time is a.time
         assert other.host_time is a.host_time
         assert other.marked is a.marked
     assert b.order is c.order
-    assert np.isnan(a.host_time).all()
-
-
-def test_host_times_are_kept():
-    host = 1.7e9 + np.arange(N)
-    signals = signals_from_tables([table("a", ["x.y"], host=host)], motor=None)
-    assert signals["x.y"].host_time is host
+    assert np.isnan(a.host_time).all() if host is None else a.host_time is host
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,7 @@ def tables_of(monkeypatch):
     return seen
 
 
-def assert_same(tables, decoded, *, wrapped=0):
+def assert_same(tables, decoded):
     version, events, rows, _ = decoded
     by_name = {table.name: table for table in tables}
     for k, (_, name, variables, _) in enumerate(events):
@@ -103,7 +103,7 @@ def assert_same(tables, decoded, *, wrapped=0):
         table = by_name[name]
         assert table.order.tolist() == [i for i, _, _ in mine]
         rate = {1: 1e3, 2: 1e6}[version]
-        assert [round(t * rate) - wrapped for t in table.time] == [stamp for _, stamp, _ in mine]
+        assert [round(t * rate) for t in table.time] == [stamp for _, stamp, _ in mine]
         assert list(table.columns) == variables
         for j, variable in enumerate(variables):
             got, expected = table.columns[variable].tolist(), [values[j] for _, _, values in mine]
@@ -158,10 +158,7 @@ def test_a_real_file_as_signals(shared_recordings):
     assert np.array_equal(signals["acceleration"].value[:, 2], column["stateEstimate.az"] * 9.81)
     assert np.array_equal(signals["stateEstimate.roll"].value[:, 0], column["stateEstimate.roll"])
     assert signals["stateEstimate.roll"].unit == "deg"
-    assert np.round(signals["position"].time * 1e6).astype(int).tolist() == [stamp for _, stamp, _ in rows]
     assert recording.metadata["usd"]["records.activeMarkerModeChanged"] == "0"
-    orders = np.concatenate([signals[n].order for n in ("position", "velocity", "voltage")])
-    assert np.unique(orders).size == orders.size
 
 
 # --- generated files ---
@@ -340,19 +337,6 @@ def test_names_that_stand_twice(put):
 def test_headers_that_lie(put, content, words):
     with pytest.raises(FileFormatError, match=words):
         opened(put(content))
-
-
-def test_gzip_and_a_bomb(put, monkeypatch):
-    import gzip
-
-    _, _, data = small_log()
-    packed = put(gzip.compress(data), "log.gz")
-    assert len(opened(packed)) == len(opened(put(data)))
-    monkeypatch.setattr("crazyem.recordings.contents.LARGEST_UNPACKED", 100)
-    with pytest.raises(FileFormatError, match="more than"):
-        opened(packed)
-    with pytest.raises(FileFormatError, match="gzip"):
-        opened(put(gzip.compress(data)[:-9], "cut.gz"))
 
 
 def test_told_from_other_files():

@@ -1,22 +1,18 @@
 """uSD card logs in parts: joined they are the whole, however the file is cut, damaged or packed."""
 
 import gzip
-import struct
-from dataclasses import fields
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from recording_files import assert_same_signals, joined
 from test_recordings_usd import FIXED, header, log, logs, record, small_log
 
 from crazyem.errors import CrazyemError, FileFormatError
-from crazyem.recordings import ReadOptions, Recording, SignalArray
+from crazyem.recordings import ReadOptions, Recording
 from crazyem.recordings.parts import open_parts
 from crazyem.recordings.usd.file import read, read_parts
-
-ARRAYS = ("time", "value", "order", "host_time", "marked")
-WORDS = [f.name for f in fields(SignalArray) if f.name not in ARRAYS]
 
 
 @pytest.fixture(autouse=True)
@@ -30,14 +26,7 @@ def words(findings):
 
 
 def assert_joined(parts: list[Recording], whole: Recording) -> None:
-    for name, array in whole.signals.items():
-        mine = [part.signals[name] for part in parts]
-        for field in ARRAYS:
-            joined = np.concatenate([getattr(a, field) for a in mine])
-            assert joined.dtype == getattr(array, field).dtype
-            assert joined.tobytes() == getattr(array, field).tobytes(), (name, field)
-        for a in mine:
-            assert [getattr(a, w) for w in WORDS] == [getattr(array, w) for w in WORDS]
+    assert_same_signals(joined(parts), whole.signals)
     for part in parts:
         assert list(part.signals) == list(whole.signals)
         assert (part.path, part.source, part.metadata, part.origin) == (
@@ -57,31 +46,23 @@ def outcome(function, path, *arguments):
         return f"{type(error).__name__}: {error}"
 
 
-@given(generated=logs(), seconds=st.sampled_from([0.0, 0.01, 0.1, 60.0]), cut=st.integers(0, 60))
-def test_parts_of_any_log_joined_are_the_whole(tmp_path_factory, generated, seconds, cut):
-    path = tmp_path_factory.mktemp("usd") / "log"
-    data = log(*generated)
-    path.write_bytes(data[: len(data) - cut])
+def parts_like_the_whole(content, path, seconds):
+    """Read a file whole and in parts, compare them, and return the parts or the words of the error."""
+    path.write_bytes(content)
     whole, parts = outcome(read, path), outcome(read_parts, path, seconds)
     if isinstance(whole, str):
         assert parts == whole
-        return
-    assert_joined(parts, whole[0])
-    if seconds == 0.0:
-        assert len(parts) == len(generated[2]) or cut
+    else:
+        assert_joined(parts, whole[0])
+    return parts
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_truncated_at_any_byte(tmp_path, version):
-    data = small_log(version)[2]
-    path = tmp_path / "log"
-    for length in [*range(0, len(data), 3), len(data)]:
-        path.write_bytes(data[:length])
-        whole, parts = outcome(read, path), outcome(read_parts, path, 0.05)
-        if isinstance(whole, str):
-            assert parts == whole
-        else:
-            assert_joined(parts, whole[0])
+@given(generated=logs(), seconds=st.sampled_from([0.0, 0.01, 0.1, 60.0]), cut=st.integers(0, 60))
+def test_parts_of_any_log_joined_are_the_whole(tmp_path_factory, generated, seconds, cut):
+    data = log(*generated)
+    parts = parts_like_the_whole(data[: len(data) - cut], tmp_path_factory.mktemp("usd") / "log", seconds)
+    if seconds == 0.0 and not cut:
+        assert len(parts) == len(generated[2])
 
 
 @given(st.data())
@@ -90,25 +71,15 @@ def test_damaged_bytes_are_the_same_in_parts(tmp_path_factory, data):
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(content) - 1))
         content[at : at + 1] = data.draw(st.binary(max_size=3))
-    path = tmp_path_factory.mktemp("usd") / "log"
-    path.write_bytes(bytes(content))
-    whole, parts = outcome(read, path), outcome(read_parts, path, 0.03)
-    if isinstance(whole, str):
-        assert parts == whole
-    else:
-        assert_joined(parts, whole[0])
+    parts_like_the_whole(bytes(content), tmp_path_factory.mktemp("usd") / "log", 0.03)
 
 
 def test_an_event_that_is_in_one_part_only_keeps_its_signals_in_all(tmp_path):
     events = [(FIXED, "fixedFrequency", [("stateEstimate.x", "f")]), (2, "other", [("a.b", "f"), ("flag", "B")])]
     rows = [(0, 10_000 * i, [i]) for i in range(100)]
     rows[70:70] = [(1, 695_000, [1.5, 7])]
-    path = tmp_path / "log"
-    path.write_bytes(log(2, events, rows))
-    parts = list(read_parts(path, ReadOptions(), seconds=0.25))
-    assert len(parts) == 4
+    parts = parts_like_the_whole(log(2, events, rows), tmp_path / "log", 0.25)
     assert [part.signals["flag"].time.size for part in parts] == [0, 0, 1, 0]
-    assert_joined(parts, read(path, ReadOptions()))
 
 
 @pytest.mark.parametrize("kind", ["request", "duty"])
@@ -141,24 +112,17 @@ def test_all_parts_agree_on_the_motors(tmp_path, kind, monkeypatch):
 def test_stamps_of_version_1_go_on_from_part_to_part(tmp_path):
     events = [(FIXED, "fixedFrequency", [("a.b", "f")]), (2, "other", [("x", "B")])]
     stamps = [2**32 - 20, 2**32 - 10, 2**32 - 12, 0, 10, 5, 20, 2**31 + 25, 1]
-    path = tmp_path / "log"
-    path.write_bytes(log(1, events, [(i % 2, stamp, [1]) for i, stamp in enumerate(stamps)]))
-    parts = list(read_parts(path, ReadOptions(), seconds=0.005))
-    assert len(parts) > 3
-    assert_joined(parts, read(path, ReadOptions()))
+    data = log(1, events, [(i % 2, stamp, [1]) for i, stamp in enumerate(stamps)])
+    assert len(parts_like_the_whole(data, tmp_path / "log", 0.005)) > 3
 
 
 def test_a_part_is_no_longer_than_told_nor_larger_than_it_may_be(tmp_path, monkeypatch):
     events = [(FIXED, "fixedFrequency", [("a.b", "f")])]
-    path = tmp_path / "log"
-    path.write_bytes(log(2, events, [(0, 10_000 * i, [i]) for i in range(1000)]))
-    parts = list(read_parts(path, ReadOptions(), seconds=1.0))
+    parts = parts_like_the_whole(log(2, events, [(0, 10_000 * i, [i]) for i in range(1000)]), tmp_path / "log", 1.0)
     assert [part.duration for part in parts[:-1]] == pytest.approx([1.0] * 9, abs=0.011)  # a record more where 0.99..9
-    path.write_bytes(log(2, events, [(0, 7, [i]) for i in range(1000)]))  # a clock that stands
     monkeypatch.setattr("crazyem.recordings.usd.file.STRETCH_BYTES", 1400)
-    parts = list(read_parts(path, ReadOptions(), seconds=1.0))
-    assert len(parts) >= 10
-    assert_joined(parts, read(path, ReadOptions()))
+    standing = log(2, events, [(0, 7, [i]) for i in range(1000)])  # the clock does not run
+    assert len(parts_like_the_whole(standing, tmp_path / "log", 1.0)) >= 10
 
 
 def test_packed_it_is_read_in_parts_as_well(tmp_path, monkeypatch):
@@ -177,10 +141,8 @@ def test_packed_it_is_read_in_parts_as_well(tmp_path, monkeypatch):
 
 def test_a_header_longer_than_a_piece_and_one_that_never_ends(tmp_path, monkeypatch):
     events = [(k, f"event{k}", [(f"g.v{i}", "B") for i in range(50)]) for k in range(20)]
-    body = header(2, events) + record(2, events[0], 5, [1] * 50)
     path = tmp_path / "log"
-    path.write_bytes(body + struct.pack("<I", 0))
-    assert_joined(list(read_parts(path, ReadOptions())), read(path, ReadOptions()))
+    parts_like_the_whole(header(2, events) + record(2, events[0], 5, [1] * 50) + bytes(4), path, 60.0)
     path.write_bytes(b"\xbc\x02\x00\x01\x00\xff\xff" + bytes([255]) * 100_000)
     monkeypatch.setattr("crazyem.recordings.usd.stretches._LONGEST_HEADER", 1000)
     with pytest.raises(FileFormatError, match="not text"):
