@@ -6,11 +6,9 @@ import reference
 import test_estimation_kernels as plain
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rigid_body import State, step
 from test_estimation_kernels import INERTIA, MASS, R_FORCE, THETA, Q, R, filled_tape, scaled
 
 from crazyem.estimation import kernels
-from crazyem.vehicle import GRAVITY
 
 ACCELEROMETER = 4  # group of its noise
 
@@ -82,45 +80,14 @@ def test_smoothed_impulses_and_residuals_are_those_of_the_augmented_smoother(see
     assert tape.stats[1:, kernels.MASS].sum() == pytest.approx(squares, rel=1e-3)
 
 
-def test_without_readings_it_is_the_filter_without_accelerometer():
-    """The augmented twin, too, is then the plain one: two textbook forms of one thing."""
-    tape = filled_tape(4)
-    value = plain.forward(tape)
-    plain.backward(tape)
-    augmented = twin(tape)
-    filtered, smoothed = plain.twin(tape)
-    assert augmented.log_likelihood == pytest.approx(filtered.log_likelihood, rel=1e-9)
-    assert value == pytest.approx(filtered.log_likelihood, rel=1e-9)
-    # impulses are corrections in the tangent space of different points: equal to second order in the correction
-    spread = np.sqrt(Q * np.diff(tape.time)[:, None])
-    np.testing.assert_allclose(augmented.impulse[1:] / spread, smoothed.impulse[1:] / spread, atol=0.01)
-    np.testing.assert_allclose(scaled(augmented.smoothed_cov), scaled(smoothed.cov, augmented.smoothed_cov), atol=1e-4)
-    assert not tape.stats[:, kernels.RESIDUAL + ACCELEROMETER].any()
-    assert not tape.stats[:, kernels.MEASURED + ACCELEROMETER].any()
-
-
 def test_a_worthless_accelerometer_changes_nothing_and_a_perfect_one_says_all():
     bare, worthless, perfect = filled_tape(2), measured_tape(2), measured_tape(2, force_missing=0.0)
-    run(bare)
-    run(worthless, r_force=1e12)
-    run(perfect, r_force=1e-12)
+    for tape, r_force in ((bare, R_FORCE), (worthless, 1e12), (perfect, 1e-12)):
+        plain.forward(tape, r_force=r_force)
+        plain.backward(tape, r_force=r_force)
     np.testing.assert_allclose(worthless.xf, bare.xf, atol=1e-8)
     np.testing.assert_allclose(worthless.moments, bare.moments, atol=1e-5)
     np.testing.assert_allclose(perfect.moments[1:, :3], perfect.force[1:], atol=1e-6)
-
-
-def run(tape, *, r_force=R_FORCE):
-    """Filter and smoother with another noise of the accelerometer."""
-    t, inverse = tape, np.linalg.inv(INERTIA)
-    kernels.forward(
-        0, t.size, True, t.time, t.kind, t.y, t.force, t.thrust, t.torque, MASS, INERTIA, inverse, Q, R, r_force, 0.5,
-        plain.START_VARIANCE, t.xp, t.pp, t.xf, t.pf, t.gain, t.s, t.e, t.blocks, t.middle, t.loglik,
-    )  # fmt: skip
-    kernels.backward(
-        0, t.size, t.time, t.kind, t.usable, t.force, t.thrust, t.torque, t.thrust_tau, t.torque_tau, t.thrust_delay,
-        t.torque_delay, THETA[4], THETA[5], plain.OFFSET, MASS, INERTIA, inverse, Q, R, r_force, 0.5, t.xf, t.pf,
-        t.gain, t.s, t.e, t.blocks, t.middle, t.stats, t.moments,
-    )  # fmt: skip
 
 
 def run_moved(name, step_):
@@ -187,28 +154,8 @@ def test_simulated_readings_are_consistent_with_the_filter():
 
     And the noise that the smoother finds in the accelerometer is the noise that was put in.
     """
-    rng = np.random.default_rng(8)
-    n, dt = 600, 0.01
-    tape = plain.Tape(n)
-    x = State(np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
-    for k in range(n):
-        if k:
-            torque = INERTIA @ (-3.0 * x.body_rate + rng.normal(size=3))
-            thrust = MASS * GRAVITY * rng.uniform(0.8, 1.2)
-            impulse = rng.normal(size=6) * np.sqrt(Q * dt)
-            x = step(x, thrust, torque, dt=dt, mass=MASS, inertia=INERTIA, impulse=impulse, lead=0.0)
-        seen = x.plus(rng.normal(size=12) * np.sqrt(R))
-        y = np.concatenate([seen.position, seen.velocity, seen.attitude, seen.body_rate])
-        tape.append(k * dt, y, starts=k == 0, keep=n)
-        if k:
-            tape.mean[k] = [thrust, *torque]
-            z = [0.0, 0.0, thrust / MASS] + impulse[:3] / dt
-            tape.force[k] = z + rng.normal(size=3) * np.sqrt(R_FORCE)
-        else:
-            tape.xp[0] = np.concatenate([x.position, x.velocity, x.attitude, x.body_rate])
-    tape.spread_inputs(0, n, np.zeros(3))
-    tape.kind[0] = 0
-    tape.pp[0] = np.diag(R)
+    n = 600
+    tape = plain.simulated(np.random.default_rng(8), n, lead=0.0, dt=0.01)
     with_readings = plain.forward(tape, lead=0.0)
     plain.backward(tape, lead=0.0)
     mean_square = np.mean(tape.e[1:] ** 2 / tape.s[1:])

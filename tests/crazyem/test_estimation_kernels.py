@@ -6,10 +6,12 @@ import reference
 import synthetic
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rigid_body import State, step, step_jacobians
 from scipy.spatial.transform import Rotation
 
 from crazyem.estimation import kernels
 from crazyem.estimation.tape import BREAK, START_VARIANCE, Tape
+from crazyem.vehicle import GRAVITY
 
 MASS = 0.036
 INERTIA = np.array([[2.0e-5, 1e-6, -5e-7], [1e-6, 2.1e-5, 8e-7], [-5e-7, 8e-7, 3.6e-5]])
@@ -19,6 +21,7 @@ UNIT = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1e-3, 1e-5, 1e-5, 1e-5])  # of the lin
 Q = np.array([0.02, 0.03, 0.05, 0.3, 0.25, 0.15]) ** 2
 R = np.repeat(np.array([1e-3, 1e-2, 3e-3, 2e-3]) ** 2, 3)
 R_FORCE = 0.3**2  # (m/s^2)^2
+LEADS = [0.0, 0.3, 0.5, 1.0]
 P0 = np.repeat([1e-4, 1e-3, 1e-3, 1e-2], 3)
 
 
@@ -46,28 +49,28 @@ def filled_tape(seed: int, n: int = 40, *, missing: float = 0.3, dither: float =
     return tape
 
 
-def forward(tape, first=0, last=None, *, restart=True, mass=MASS, inertia=INERTIA, q=Q, r=R, lead=0.5):
+def forward(tape, first=0, last=None, *, restart=True, mass=MASS, inertia=INERTIA, q=Q, r=R, r_force=R_FORCE, lead=0.5):
     t, last = tape, tape.size if last is None else last
     return kernels.forward(
         first, last, restart, t.time, t.kind, t.y, t.force, t.thrust, t.torque, mass, inertia, np.linalg.inv(inertia),
-        q, r, R_FORCE, lead, START_VARIANCE, t.xp, t.pp, t.xf, t.pf, t.gain, t.s, t.e, t.blocks, t.middle, t.loglik,
+        q, r, r_force, lead, START_VARIANCE, t.xp, t.pp, t.xf, t.pf, t.gain, t.s, t.e, t.blocks, t.middle, t.loglik,
     )  # fmt: skip
 
 
-def backward(tape, first=0, last=None, *, mass=MASS, inertia=INERTIA, q=Q, r=R, tau=THETA[4], delay=THETA[5], lead=0.5):
+def backward(tape, first=0, last=None, *, q=Q, r=R, r_force=R_FORCE, lead=0.5):
     t, last = tape, tape.size if last is None else last
     kernels.backward(
         first, last, t.time, t.kind, t.usable, t.force, t.thrust, t.torque, t.thrust_tau, t.torque_tau, t.thrust_delay,
-        t.torque_delay, tau, delay, OFFSET, mass, inertia, np.linalg.inv(inertia), q, r, R_FORCE, lead, t.xf, t.pf,
-        t.gain, t.s, t.e, t.blocks, t.middle, t.stats, t.moments,
+        t.torque_delay, THETA[4], THETA[5], OFFSET, MASS, INERTIA, np.linalg.inv(INERTIA), q, r, r_force, lead, t.xf,
+        t.pf, t.gain, t.s, t.e, t.blocks, t.middle, t.stats, t.moments,
     )  # fmt: skip
 
 
-def sensitivities(tape, theta=THETA, inertia=INERTIA, *, lead=0.5):
+def sensitivities(tape, *, lead=0.5):
     t = tape
     return kernels.sensitivities(
         0, t.size, t.time, t.kind, t.usable, t.force, t.thrust, t.torque, t.thrust_tau, t.torque_tau, t.thrust_delay,
-        t.torque_delay, theta, UNIT, inertia, np.linalg.inv(inertia), Q, R_FORCE, lead, t.xf, t.gain, t.s, t.e,
+        t.torque_delay, THETA, UNIT, INERTIA, np.linalg.inv(INERTIA), Q, R_FORCE, lead, t.xf, t.gain, t.s, t.e,
         t.blocks, t.middle, t.score,
     )  # fmt: skip
 
@@ -80,19 +83,47 @@ def twin(tape, *, lead=0.5) -> tuple[reference.Filtered, reference.Smoothed]:
     return filtered, reference.rauch_tung_striebel(tape.time, filtered, q=Q)
 
 
+def simulated(rng, n, *, lead, dt=0.02, error=1.0) -> Tape:
+    """A drone under the model's own noise, within the step too, measured with the filter's noise times `error`."""
+    tape = Tape(n)
+    start = State(np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
+    x = start.plus(rng.normal(size=12) * np.sqrt(P0))
+    for k in range(n):
+        if k:
+            thrust, torque = MASS * GRAVITY * rng.uniform(0.8, 1.2), INERTIA @ (-3.0 * x.body_rate + rng.normal(size=3))
+            impulse = rng.normal(size=6) * np.sqrt(Q * dt)
+            values = {"dt": dt, "mass": MASS, "inertia": INERTIA, "impulse": impulse, "lead": lead}
+            before, x = x, step(x, thrust, torque, **values)
+            if lead == 0.5:
+                _, g = step_jacobians(before, thrust, torque, **values)
+                within = rng.normal(size=6) * np.sqrt(Q * dt**3 / 12)
+                x = x.plus(np.concatenate([g[3:6, :3] @ within[:3], np.zeros(3), g[6:9, 3:] @ within[3:] / (dt / 2),
+                                           np.zeros(3)]))  # fmt: skip
+        seen = x.plus(error * rng.normal(size=12) * np.sqrt(R))
+        tape.append(k * dt, np.concatenate([*seen]), starts=False, keep=n)
+        if k:
+            tape.mean[k] = [thrust, *torque]
+            tape.force[k] = [0.0, 0.0, thrust / MASS] + impulse[:3] / dt + rng.normal(size=3) * np.sqrt(R_FORCE)
+    tape.spread_inputs(0, n, np.zeros(3))
+    tape.kind[0] = 0
+    tape.xp[0] = np.concatenate([*start])
+    tape.pp[0] = np.diag(P0)
+    return tape
+
+
 def assert_same_state(row, state):
     np.testing.assert_allclose(row[:6], np.concatenate([state.position, state.velocity]), atol=1e-9)
     np.testing.assert_allclose(row[10:], state.body_rate, atol=1e-8)
     np.testing.assert_allclose(np.abs(row[6:10] @ state.attitude), 1.0, atol=1e-13)
 
 
-@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3, 0.8]))
-@settings(max_examples=6)
-def test_filter_is_the_textbook_filter(seed, missing):
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3, 0.8]), st.sampled_from(LEADS))
+@settings(max_examples=8)
+def test_filter_is_the_textbook_filter(seed, missing, lead):
     """Scalar updates and joint updates agree to rounding, missing data, uneven steps, products of inertia and all."""
     tape = filled_tape(seed, missing=missing, dither=1e-3)  # turns of up to 0.1 rad a step
-    value = forward(tape)
-    ours, _ = twin(tape)
+    value = forward(tape, lead=lead)
+    ours, _ = twin(tape, lead=lead)
     assert value == pytest.approx(ours.log_likelihood, rel=1e-9, abs=1e-6)
     assert value == pytest.approx(tape.loglik.sum(), rel=1e-12)
     for k in range(tape.size):
@@ -109,14 +140,14 @@ def scaled(cov, by=None):
     return cov / (d[:, :, None] * d[:, None, :])
 
 
-@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3, 0.8]))
-@settings(max_examples=6)
-def test_smoother_and_statistics_are_those_of_rauch_tung_striebel(seed, missing):
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3, 0.8]), st.sampled_from(LEADS))
+@settings(max_examples=8)
+def test_smoother_and_statistics_are_those_of_rauch_tung_striebel(seed, missing, lead):
     """Expected squares of impulses and measurement residuals from the twin's covariances, not from the kernel's."""
     tape = filled_tape(seed, missing=missing)
-    forward(tape)
-    backward(tape)
-    _, smoothed = twin(tape)
+    forward(tape, lead=lead)
+    backward(tape, lead=lead)
+    _, smoothed = twin(tape, lead=lead)
     force, acceleration = reference.expected_accelerations(
         tape.time, tape.thrust, tape.torque, smoothed, mass=MASS, inertia=INERTIA
     )
@@ -268,17 +299,18 @@ def moved(seed: int, name: int, step: float, *, lead: float = 0.5) -> tuple[floa
     return value, tape.e.copy()
 
 
+@pytest.mark.parametrize("lead", [0.5, 0.0, 1.0])
 @pytest.mark.parametrize("name", range(9))
-def test_score_and_information_against_finite_differences(name):
+def test_score_and_information_against_finite_differences(name, lead):
     """The score is the slope of the log-likelihood; information sums squared slopes of the innovations.
 
     What the sensitivities leave out is how the gains change with the parameters (through the Jacobians): small.
     """
     seed, h = 7, 1e-4
     tape = filled_tape(seed, missing=0.2)
-    forward(tape)
-    info = sensitivities(tape)
-    (high, e_high), (low, e_low) = moved(seed, name, h), moved(seed, name, -h)
+    forward(tape, lead=lead)
+    info = sensitivities(tape, lead=lead)
+    (high, e_high), (low, e_low) = moved(seed, name, h, lead=lead), moved(seed, name, -h, lead=lead)
     slope = (high - low) / (2 * h)
     sd = 1 / np.sqrt(info[name, name])
     assert tape.score[:, name].sum() * sd == pytest.approx(slope * sd, abs=0.05)
