@@ -11,6 +11,7 @@ from crazyem.estimation.contact import CLEARANCE_HEIGHT, CONFIRMING_HEIGHTS, CON
 
 MAX = 0.48  # N, four rotors of 0.12 N
 HOVER = 0.28
+IDLE = 0.9 * OFF_FRACTION * MAX
 nan = math.nan
 
 
@@ -20,17 +21,35 @@ def run(*samples, thrust_max=MAX):
     return [gate.update(height=s[0], thrust=s[1], flying=s[2] if len(s) > 2 else None) for s in samples]
 
 
-def test_a_flight_from_the_ground_and_back():
-    heights = [0.0, 0.0, 0.01, 0.05, 0.09, 0.5, 1.0, 0.5, 0.09, 0.06, 0.04, 0.0, 0.0]
-    thrusts = [0.0, 0.2, 0.3, *[HOVER] * 8, 0.2, 0.0]
-    expected = [False, False, False, False, False, True, True, True, True, True, False, False, False]
-    assert run(*zip(heights, thrusts)) == expected
+Y, N = True, False
+FLIGHTS = {
+    "from the ground and back": (
+        (0.0, 0.0), (0.0, 0.2), (0.01, 0.3), (0.05, HOVER), (0.09, HOVER), (0.5, HOVER), (1.0, HOVER), (0.5, HOVER),
+        (0.09, HOVER), (0.06, HOVER), (0.04, HOVER), (0.0, 0.2), (0.0, 0.0), [N, N, N, N, N, Y, Y, Y, Y, Y, N, N, N],
+    ),
+    "from a table": ((0.75, 0.0), (0.78, HOVER), (0.92, HOVER), (0.79, HOVER), [N, N, Y, N]),
+    "a second rest on a higher place": (
+        (0.0, 0.0), (0.5, HOVER), (0.4, 0.0), (0.42, HOVER), (0.57, HOVER), [N, Y, N, N, Y],
+    ),
+    "far above the ground at once": ((0.0, 0.0), (2 * CLEARANCE_HEIGHT, HOVER), [N, Y]),
+    "a recording that begins in flight": ((1.0, HOVER), (1.01, HOVER), (0.02, HOVER), [Y, Y, Y]),
+    "after its landing the ground is known": ((1.0, HOVER), (0.0, 0.0), (0.03, HOVER), (0.2, HOVER), [Y, N, N, Y]),
+    "no height at all": ((nan, 0.0), (nan, HOVER), (nan, 0.01), [N, Y, N]),
+    "a lost height keeps the verdict": (
+        (0.0, 0.0), (nan, HOVER), (0.5, HOVER), (nan, HOVER), (0.01, HOVER), (nan, HOVER), [N, N, Y, Y, N, N],
+    ),
+    "the firmware says not flying": (
+        (0.0, 0.0), (0.5, HOVER, False), (0.5, HOVER, True), (0.02, HOVER, True), [N, N, N, N],
+    ),
+    "the firmware says flying": ((0.0, 0.0, False), (0.5, HOVER, True), [N, Y]),
+    "idling rotors are off": ((0.0, IDLE), (1.0, IDLE), [N, N]),
+}  # fmt: skip
 
 
-def test_height_counts_from_where_it_rested():
-    assert run((0.75, 0.0), (0.78, HOVER), (0.92, HOVER), (0.79, HOVER)) == [False, False, True, False]
-    # a second rest on something higher
-    assert run((0.0, 0.0), (0.5, HOVER), (0.4, 0.0), (0.42, HOVER), (0.57, HOVER)) == [False, True, False, False, True]
+@pytest.mark.parametrize("name", FLIGHTS)
+def test_verdicts_of_a_flight(name):
+    *samples, expected = FLIGHTS[name]
+    assert run(*samples) == expected
 
 
 def test_a_slow_take_off_is_believed_when_it_is_seen_again_and_again():
@@ -46,41 +65,12 @@ def test_a_slow_take_off_is_believed_when_it_is_seen_again_and_again():
     ]  # fmt: skip
 
 
-def test_far_above_is_flight_at_once():
-    assert run((0.0, 0.0), (2 * CLEARANCE_HEIGHT, HOVER)) == [False, True]
-
-
-def test_a_recording_that_begins_in_flight():
-    assert run((1.0, HOVER), (1.01, HOVER), (0.02, HOVER)) == [True, True, True]
-    # once it has landed the ground is known
-    assert run((1.0, HOVER), (0.0, 0.0), (0.03, HOVER), (0.2, HOVER)) == [True, False, False, True]
-
-
-def test_no_height_at_all():
-    assert run((nan, 0.0), (nan, HOVER), (nan, 0.01)) == [False, True, False]
-
-
-def test_a_lost_height_keeps_the_verdict():
-    assert run((0.0, 0.0), (nan, HOVER), (0.5, HOVER), (nan, HOVER), (0.01, HOVER), (nan, HOVER)) == [
-        False, False, True, True, False, False]  # fmt: skip
-
-
-def test_the_firmware_has_the_last_word_when_it_says_not_flying():
-    assert run((0.0, 0.0), (0.5, HOVER, False), (0.5, HOVER, True), (0.02, HOVER, True)) == [False, False, False, False]
-    assert run((0.0, 0.0, False), (0.5, HOVER, True)) == [False, True]
-
-
 def test_the_gap_between_clearance_and_contact_keeps_noise_from_toggling():
     between = (CLEARANCE_HEIGHT + CONTACT_HEIGHT) / 2
     rising = run((0.0, 0.0), *[(between + 0.01 * (-1) ** k, HOVER) for k in range(10)])
     assert not any(rising)
     falling = run((0.0, 0.0), (0.5, HOVER), *[(between + 0.01 * (-1) ** k, HOVER) for k in range(10)])
     assert all(falling[1:])
-
-
-def test_idling_rotors_are_off():
-    idle = 0.9 * OFF_FRACTION * MAX
-    assert run((0.0, idle), (1.0, idle)) == [False, False]
 
 
 def test_unknown_largest_thrust_takes_only_zero_for_off():
@@ -139,8 +129,3 @@ def test_rotors_off_is_never_flight(samples):
     for (_, thrust, flying), verdict in zip(samples, run(*samples)):
         if thrust <= OFF_FRACTION * MAX or flying is False:
             assert not verdict
-
-
-@pytest.mark.parametrize("height", [nan, 0.0, 1.0])
-def test_a_gate_decides_from_the_first_sample(height):
-    assert run((height, 0.0)) == [False]
