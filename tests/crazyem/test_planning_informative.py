@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pytest
@@ -54,6 +55,13 @@ def estimate(sd: float, *, identifiable: bool = True) -> Estimate:
     return Estimate(time=1.0, parameters=said, noise=dict.fromkeys(NAMES, 1e-3))
 
 
+def started(**settings: Any) -> tuple[Informative, Trajectory]:
+    """A started trajectory, and its path from one metre above the origin."""
+    made = Informative(VEHICLE, **{"planner": Made(), **settings})
+    made.start()
+    return made, made((0.0, 0.0, 1.0), 0.0)
+
+
 def flown(trajectory: Trajectory, *, step: float = 0.01) -> list[Reference]:
     references, time = [], 0.0
     while not trajectory.finished() and time < trajectory.duration:
@@ -63,8 +71,7 @@ def flown(trajectory: Trajectory, *, step: float = 0.01) -> list[Reference]:
 
 
 def test_segments_follow_one_another_until_time_is_up_and_all_is_at_rest_then() -> None:
-    planner = Made()
-    made = Informative(VEHICLE, duration=17.0, planner=planner)
+    made = Informative(VEHICLE, duration=17.0, planner=Made())
     made.start()
     path = made((1.0, 2.0, 1.5), 0.4)
     seen = flown(path)
@@ -79,18 +86,15 @@ def test_segments_follow_one_another_until_time_is_up_and_all_is_at_rest_then() 
 
 
 def test_before_its_begin_it_hovers() -> None:
-    made = Informative(VEHICLE, planner=Made())
-    made.start()
-    path = after_hover(made((0.0, 0.0, 1.0), 0.0), seconds=2.0)
+    made, path = started()
+    path = after_hover(path, seconds=2.0)
     assert path.at(1.0).position == (0.0, 0.0, 1.0)
     assert made.segments == 0
     assert not path.finished()
 
 
 def test_the_goal_ends_the_flight_at_the_end_of_a_segment() -> None:
-    made = Informative(VEHICLE, duration=60.0, goal=0.05, planner=Made())
-    made.start()
-    path = made((0.0, 0.0, 1.0), 0.0)
+    made, path = started(duration=60.0, goal=0.05)
     made.estimate = lambda: estimate(0.02)
     seen = flown(path)
     assert made.segments == 1
@@ -100,28 +104,22 @@ def test_the_goal_ends_the_flight_at_the_end_of_a_segment() -> None:
 
 @pytest.mark.parametrize("said", [estimate(0.05), estimate(0.01, identifiable=False), None])
 def test_a_goal_that_is_not_met_is_flown_for_on(said: Estimate | None) -> None:
-    made = Informative(VEHICLE, duration=12.0, goal=0.05, planner=Made())
-    made.start()
-    path = made((0.0, 0.0, 1.0), 0.0)
+    made, path = started(duration=12.0, goal=0.05)
     made.estimate = lambda: said
     flown(path)
     assert made.segments == 2
 
 
 def test_a_late_plan_is_waited_for_in_hover() -> None:
-    planner = Made(late=100)
-    made = Informative(VEHICLE, duration=12.0, planner=planner)
-    made.start()
-    seen = flown(made((0.0, 0.0, 1.0), 0.0))
+    made, path = started(duration=12.0, planner=Made(late=100))
+    seen = flown(path)
     waiting = seen[round(SEGMENT / 0.01) + 5 : round(SEGMENT / 0.01) + 90]
     assert all(r.position == (0.0, 0.0, 1.0) and r.velocity == (0.0, 0.0, 0.0) for r in waiting)
     assert made.segments == 2
 
 
 def test_without_a_further_plan_the_flight_ends() -> None:
-    made = Informative(VEHICLE, duration=60.0, planner=Made(answers=1))
-    made.start()
-    path = made((0.0, 0.0, 1.0), 0.0)
+    made, path = started(duration=60.0, planner=Made(answers=1))
     flown(path)
     assert made.segments == 1
     assert path.finished()
@@ -129,12 +127,11 @@ def test_without_a_further_plan_the_flight_ends() -> None:
 
 def test_what_is_known_goes_into_the_next_request() -> None:
     planner = Made()
-    made = Informative(VEHICLE, planner=planner)
-    made.start()
+    made, path = started(planner=planner)
     assert all(math.isinf(s) for s in planner.requests[0].spread)
     assert planner.requests[0].noise is None
     made.estimate = lambda: estimate(0.04)
-    made((0.0, 0.0, 1.0), 0.0).at(0.0)
+    path.at(0.0)
     request = planner.requests[1]
     assert request.vehicle.mass == pytest.approx(0.03)
     assert request.spread == pytest.approx((0.04,) * 4)
@@ -144,12 +141,11 @@ def test_what_is_known_goes_into_the_next_request() -> None:
 
 def test_an_estimate_far_from_the_file_is_not_planned_by() -> None:
     planner = Made()
-    made = Informative(VEHICLE, planner=planner)
-    made.start()
+    made, path = started(planner=planner)
     wrong = ParameterEstimate(5.0 * VEHICLE.inertia[0], 1e-6, (0.0, 1.0), "", True, "")
     said = estimate(0.04)
     made.estimate = lambda: Estimate(time=1.0, parameters={**said.parameters, "Ixx": wrong}, noise=said.noise)
-    made((0.0, 0.0, 1.0), 0.0).at(0.0)
+    path.at(0.0)
     assert planner.requests[1].vehicle.inertia == VEHICLE.inertia
 
 

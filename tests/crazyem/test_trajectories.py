@@ -72,13 +72,15 @@ def test_no_two_axes_share_a_line():
 
 
 @given(st.floats(-2, 2), st.floats(0.5, 40.0))
-def test_hover_and_excite_stay_finite_for_any_duration(yaw, duration):
+def test_they_stay_finite_and_end_where_they_began_for_any_duration(yaw, duration):
     for kind in (hover, excite, figure8):
         trajectory = kind(position=HOME, yaw=yaw, duration=duration)
         for t in np.linspace(-0.1, duration + 0.1, 7):
             r = trajectory.at(float(t))
             assert all(math.isfinite(v) for v in r.position + r.velocity + r.acceleration)
             assert np.linalg.norm(r.quaternion) == pytest.approx(1)
+        np.testing.assert_allclose(trajectory.at(trajectory.duration).position, HOME, atol=1e-9)
+        assert trajectory.at(trajectory.duration).yaw == pytest.approx(yaw, abs=1e-9)
 
 
 @given(st.floats(0.5, 60.0), st.floats(1.0, 8.0), st.floats(0.2, 5.0))
@@ -86,18 +88,10 @@ def test_a_figure_8_is_whole_and_ends_at_rest_where_it_began(duration, period, r
     trajectory = figure8(position=HOME, yaw=0.3, duration=duration, period=period, ramp=ramp)
     assert abs(trajectory.duration - duration) <= period / 2 + 1e-9 or trajectory.duration == period + min(ramp, period)
     end = trajectory.at(trajectory.duration)
-    np.testing.assert_allclose(end.position, HOME, atol=1e-9)
     np.testing.assert_allclose(end.velocity + end.acceleration, 0, atol=1e-6)
     # whole figures: as much time on either side
     x = [trajectory.at(t).position[0] - HOME[0] for t in np.linspace(0.0, trajectory.duration, 4001)]
     assert sum(v > 1e-3 for v in x) == pytest.approx(sum(v < -1e-3 for v in x), rel=0.02)
-
-
-@given(st.floats(1.0, 40.0))
-def test_the_excitation_ends_where_it_began(duration):
-    trajectory = excite(position=HOME, duration=duration)
-    np.testing.assert_allclose(trajectory.at(duration).position, HOME, atol=1e-9)
-    assert trajectory.at(duration).yaw == pytest.approx(0.0, abs=1e-9)
 
 
 def test_waypoints_pass_through_points_at_their_times(tmp_path):

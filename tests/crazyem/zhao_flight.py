@@ -9,7 +9,7 @@ of crazyem is imported but the type of a sample (in `samples`).
 from dataclasses import dataclass
 
 import numpy as np
-from synthetic import matrix, turned
+from synthetic import COLUMNS, matrix, turned
 
 from crazyem.compiled import kernel
 
@@ -101,9 +101,6 @@ def fly(*, seed: int, seconds: float = 4.0, force: float = 5e-4, torque: float =
         rng.normal(size=(n, 15)),
     )  # fmt: skip
     return Flight(np.arange(n) * DT, y, f, wrench, x)
-
-
-COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 
 
 def samples(flight: Flight, signals: tuple[str, ...] = ("position", "body_rate")) -> list:
