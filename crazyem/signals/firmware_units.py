@@ -53,9 +53,8 @@ _UNIT_PATTERNS: tuple[tuple[str, str], ...] = (
     (r"kalman\.var[XYZ]", "m^2"),
     (r"kalman\.varP[XYZ]", "m^2/s^2"),
 )
-_COMPILED_PATTERNS = tuple((re.compile(pattern), unit) for pattern, unit in _UNIT_PATTERNS)
 
 
 def unit_of(name: str) -> str:
     """Unit of a firmware log variable as logged, "" if unknown."""
-    return next((unit for pattern, unit in _COMPILED_PATTERNS if pattern.fullmatch(name)), "")
+    return next((unit for pattern, unit in _UNIT_PATTERNS if re.fullmatch(pattern, name)), "")

@@ -37,20 +37,21 @@ class Mapping:
         return tuple(f"{self.message}.{name}" for name in self.fields)
 
 
-def _named(pattern: str, parts: str) -> tuple[str, ...]:
+def named(pattern: str, parts: str) -> tuple[str, ...]:
+    """The names that `pattern` gives with each word of `parts` for its asterisk."""
     return tuple(pattern.replace("*", part) for part in parts.split())
 
 
-_XYZ, _V = _named("*", "x y z"), _named("v*", "x y z")
-_ANGLES, _SPEEDS = _named("*", "roll pitch yaw"), _named("*speed", "roll pitch yaw")
-_ACC, _GYRO = _named("*acc", "x y z"), _named("*gyro", "x y z")
-_FOUR = _named("m*", "1 2 3 4")
+_XYZ, _V = named("*", "x y z"), named("v*", "x y z")
+_ANGLES, _SPEEDS = named("*", "roll pitch yaw"), named("*speed", "roll pitch yaw")
+_ACC, _GYRO = named("*acc", "x y z"), named("*gyro", "x y z")
+_FOUR = named("m*", "1 2 3 4")
 
 # Best first within a signal: body rates from the message of the attitude are better than those of another instant.
 MAPPINGS: tuple[Mapping, ...] = (
     Mapping("position", "LOCAL_POSITION_NED", _XYZ),
     Mapping("velocity", "LOCAL_POSITION_NED", _V),
-    Mapping("attitude", "ATTITUDE_QUATERNION", _named("q*", "1 2 3 4"), "quaternion"),
+    Mapping("attitude", "ATTITUDE_QUATERNION", named("q*", "1 2 3 4"), "quaternion"),
     Mapping("attitude", "ATTITUDE", _ANGLES, "angles"),
     Mapping("body_rate", "ATTITUDE_QUATERNION", _SPEEDS),
     Mapping("body_rate", "ATTITUDE", _SPEEDS),

@@ -49,8 +49,8 @@ class Packet:
     values: tuple[float, ...]
 
 
-# name -> (number of components, unit, frame)
-SIGNALS: dict[str, tuple[int, str, str]] = {
+# name -> (number of components, unit, frame), of the signals that the estimator uses
+_ESTIMATED: dict[str, tuple[int, str, str]] = {
     "position": (3, "m", "world"),
     "velocity": (3, "m/s", "world"),
     "attitude": (4, "1", "quaternion x y z w, body (FLU) to world"),
@@ -63,7 +63,11 @@ SIGNALS: dict[str, tuple[int, str, str]] = {
     "setpoint_position": (3, "m", "world"),
     "setpoint_velocity": (3, "m/s", "world"),
     "flying": (1, "1", "1 while the firmware says that rotors turn, else 0"),
-    # Additional signals of recordings, for diagnosis and viewers, not for the estimator.
+}
+ESTIMATOR_SIGNALS = tuple(_ESTIMATED)
+SIGNALS = {
+    **_ESTIMATED,
+    # additional signals of recordings, for diagnosis and viewers
     "acceleration": (3, "m/s^2", "world, gravity removed"),
     "euler": (3, "rad", "roll, pitch, yaw (ZYX, right-handed), body FLU to world"),
     "motor_request": (4, "1", "thrust asked of rotors 1..4 before battery compensation, 0..1"),
@@ -84,22 +88,6 @@ COMPONENTS: dict[str, tuple[str, ...]] = {
     "wrench_command": ("thrust", "torque_x", "torque_y", "torque_z"),
     "mixer_command": ("thrust", "roll", "pitch", "yaw"),
 }
-
-# Inputs of the estimator; other signals of a recording are not used by it.
-ESTIMATOR_SIGNALS: tuple[str, ...] = (
-    "position",
-    "velocity",
-    "attitude",
-    "body_rate",
-    "specific_force",
-    "motor_command",
-    "rotor_speed",
-    "voltage",
-    "wrench_command",
-    "setpoint_position",
-    "setpoint_velocity",
-    "flying",
-)
 
 
 def components(quantity: str) -> tuple[str, ...]:

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import UsageError
-from crazyem.signals.mavlink import MAPPINGS
+from crazyem.signals.mavlink import MAPPINGS, RPM_IN_RAD_PER_S, named
 from crazyem.signals.sample import ESTIMATOR_SIGNALS, SIGNALS, Block, Packet, Sample
 
 STANDARD_GRAVITY = 9.81  # m/s^2, the constant in the firmware
-_RPM_IN_RAD_PER_S = 2.0 * math.pi / 60.0
 _RPM_MISSING = 65535.0
 _QUAT_MASK = (1 << 9) - 1
 _NAN = float("nan")
@@ -87,14 +86,14 @@ class Conversion:
 def _scaled(factor: float) -> Conversion:
     return Conversion(
         lambda values: tuple(float(v) * factor for v in values),
-        lambda columns: np.column_stack([np.asarray(c, float) * factor for c in columns]),
+        lambda columns: _stacked(columns) * factor,
     )
 
 
 def _divided(divisor: float) -> Conversion:
     return Conversion(
         lambda values: tuple(float(v) / divisor for v in values),
-        lambda columns: np.column_stack([np.asarray(c, float) / divisor for c in columns]),
+        lambda columns: _stacked(columns) / divisor,
     )
 
 
@@ -174,11 +173,11 @@ _legacy_rates = Conversion(
 
 def _rpm_many(columns: Columns) -> NDArray[np.float64]:
     rpm = _stacked(columns)
-    return np.where(rpm == _RPM_MISSING, np.nan, rpm * _RPM_IN_RAD_PER_S)
+    return np.where(rpm == _RPM_MISSING, np.nan, rpm * RPM_IN_RAD_PER_S)
 
 
 _rpm = Conversion(
-    lambda values: tuple(_NAN if v == _RPM_MISSING else float(v) * _RPM_IN_RAD_PER_S for v in values), _rpm_many
+    lambda values: tuple(_NAN if v == _RPM_MISSING else float(v) * RPM_IN_RAD_PER_S for v in values), _rpm_many
 )
 
 
@@ -231,10 +230,6 @@ def _conversion(kind: str, factor: float) -> Conversion:
     return fixed.get(kind) or (_half_turn if kind == "vector" else _scaled)(factor)
 
 
-def _names(pattern: str, parts: str) -> tuple[str, ...]:
-    return tuple(pattern.replace("*", part) for part in parts.split())
-
-
 MAVLINK_SOURCES: tuple[Source, ...] = tuple(
     Source(m.signal, m.variables, _conversion(m.kind, m.factor)) for m in MAPPINGS
 )
@@ -242,54 +237,54 @@ _MAVLINK_OUTPUTS = tuple(s for s in MAVLINK_SOURCES if s.signal == "motor_comman
 
 # Best first within a signal: a float log before its quantised form.
 SOURCES: tuple[Source, ...] = (
-    Source("position", _names("stateEstimate.*", "x y z"), _as_is),
-    Source("position", _names("stateEstimateZ.*", "x y z"), _divided(1000.0)),
-    Source("velocity", _names("stateEstimate.*", "vx vy vz"), _as_is),
-    Source("velocity", _names("stateEstimateZ.*", "vx vy vz"), _divided(1000.0)),
-    Source("attitude", _names("stateEstimate.*", "qx qy qz qw"), _as_is),
-    Source("attitude", _names("kalman.*", "q0 q1 q2 q3"), _scalar_first),
+    Source("position", named("stateEstimate.*", "x y z"), _as_is),
+    Source("position", named("stateEstimateZ.*", "x y z"), _divided(1000.0)),
+    Source("velocity", named("stateEstimate.*", "vx vy vz"), _as_is),
+    Source("velocity", named("stateEstimateZ.*", "vx vy vz"), _divided(1000.0)),
+    Source("attitude", named("stateEstimate.*", "qx qy qz qw"), _as_is),
+    Source("attitude", named("kalman.*", "q0 q1 q2 q3"), _scalar_first),
     Source("attitude", ("stateEstimateZ.quat",), _compressed),
-    Source("attitude", _names("stateEstimate.*", "roll pitch yaw"), _legacy_euler),
-    Source("body_rate", _names("gyro.*", "x y z"), _scaled(math.pi / 180.0)),
-    Source("body_rate", _names("stateEstimateZ.*", "rateRoll ratePitch rateYaw"), _legacy_rates),
-    Source("specific_force", _names("acc.*", "x y z"), _scaled(STANDARD_GRAVITY)),
-    Source("motor_command", _names("motor.*", "m1 m2 m3 m4"), _divided(65535.0)),  # present firmware, as over a link
-    Source("rotor_speed", _names("motor.*_rpm", "m1 m2 m3 m4"), _rpm),
-    Source("rotor_speed", _names("rpm.*", "m1 m2 m3 m4"), _rpm),
+    Source("attitude", named("stateEstimate.*", "roll pitch yaw"), _legacy_euler),
+    Source("body_rate", named("gyro.*", "x y z"), _scaled(math.pi / 180.0)),
+    Source("body_rate", named("stateEstimateZ.*", "rateRoll ratePitch rateYaw"), _legacy_rates),
+    Source("specific_force", named("acc.*", "x y z"), _scaled(STANDARD_GRAVITY)),
+    Source("motor_command", named("motor.*", "m1 m2 m3 m4"), _divided(65535.0)),  # present firmware, as over a link
+    Source("rotor_speed", named("motor.*_rpm", "m1 m2 m3 m4"), _rpm),
+    Source("rotor_speed", named("rpm.*", "m1 m2 m3 m4"), _rpm),
     Source("voltage", ("pm.vbat",), _as_is),
     # whole mV of a cell, truncated (pmSetBatteryVoltage): uncorrected, thrust and mass would be 0.025 % too small
     Source("voltage", ("pm.vbatMV",), _cut_off(1000.0)),
-    Source("wrench_command", _names("ctrlLee.*", "thrustSi torquex torquey torquez"), _as_is),
-    Source("wrench_command", _names("ctrlLqg.*", "thrustSi torquex torquey torquez"), _as_is),
-    Source("setpoint_position", _names("ctrltarget.*", "x y z"), _as_is),
-    Source("setpoint_position", _names("ctrltargetZ.*", "x y z"), _divided(1000.0)),
-    Source("setpoint_velocity", _names("ctrltarget.*", "vx vy vz"), _as_is),
-    Source("setpoint_velocity", _names("ctrltargetZ.*", "vx vy vz"), _divided(1000.0)),
+    Source("wrench_command", named("ctrlLee.*", "thrustSi torquex torquey torquez"), _as_is),
+    Source("wrench_command", named("ctrlLqg.*", "thrustSi torquex torquey torquez"), _as_is),
+    Source("setpoint_position", named("ctrltarget.*", "x y z"), _as_is),
+    Source("setpoint_position", named("ctrltargetZ.*", "x y z"), _divided(1000.0)),
+    Source("setpoint_velocity", named("ctrltarget.*", "vx vy vz"), _as_is),
+    Source("setpoint_velocity", named("ctrltargetZ.*", "vx vy vz"), _divided(1000.0)),
     Source("flying", ("supervisor.info",), _flying_bit),
     Source("flying", ("sys.isFlying",), _as_is),
-    Source("acceleration", _names("stateEstimate.*", "ax ay az"), _scaled(STANDARD_GRAVITY)),
-    Source("acceleration", _names("stateEstimateZ.*", "ax ay az"), _compressed_acceleration),
-    Source("mixer_command", _names("controller.cmd_*", "thrust roll pitch yaw"), _as_is),
-    Source("setpoint_acceleration", _names("ctrltarget.*", "ax ay az"), _as_is),
+    Source("acceleration", named("stateEstimate.*", "ax ay az"), _scaled(STANDARD_GRAVITY)),
+    Source("acceleration", named("stateEstimateZ.*", "ax ay az"), _compressed_acceleration),
+    Source("mixer_command", named("controller.cmd_*", "thrust roll pitch yaw"), _as_is),
+    Source("setpoint_acceleration", named("ctrltarget.*", "ax ay az"), _as_is),
     *MAVLINK_SOURCES,
 )
 # motor.m1..4 is a duty or a request, depending on the firmware (crazyem/recordings/motor_meaning.py); pwm.* is a duty.
 DUTY_SOURCES: tuple[Source, ...] = (
-    Source("motor_command", _names("pwm.*_pwm", "m1 m2 m3 m4"), _divided(65535.0)),
-    Source("motor_command", _names("motor.*", "m1 m2 m3 m4"), _divided(65535.0)),
+    Source("motor_command", named("pwm.*_pwm", "m1 m2 m3 m4"), _divided(65535.0)),
+    Source("motor_command", named("motor.*", "m1 m2 m3 m4"), _divided(65535.0)),
     *_MAVLINK_OUTPUTS,
 )
 REQUEST_SOURCES: tuple[Source, ...] = (
-    Source("motor_command", _names("pwm.*_pwm", "m1 m2 m3 m4"), _divided(65535.0)),
-    Source("motor_request", _names("motor.*", "m1 m2 m3 m4"), _divided(65535.0)),
+    Source("motor_command", named("pwm.*_pwm", "m1 m2 m3 m4"), _divided(65535.0)),
+    Source("motor_request", named("motor.*", "m1 m2 m3 m4"), _divided(65535.0)),
     *_MAVLINK_OUTPUTS,
 )
 
 # Default blocks of the estimator; each fits into one packet of 26 bytes.
-STATE_BLOCK = _names("stateEstimateZ.*", "x y z vx vy vz quat")
-IMU_BLOCK = (*_names("gyro.*", "x y z"), *_names("acc.*", "x y z"))
-MOTOR_BLOCK = (*_names("motor.*", "m1 m2 m3 m4"), "pm.vbatMV", "supervisor.info")
-ROTOR_SPEED_BLOCK = _names("motor.*_rpm", "m1 m2 m3 m4")
+STATE_BLOCK = named("stateEstimateZ.*", "x y z vx vy vz quat")
+IMU_BLOCK = (*named("gyro.*", "x y z"), *named("acc.*", "x y z"))
+MOTOR_BLOCK = (*named("motor.*", "m1 m2 m3 m4"), "pm.vbatMV", "supervisor.info")
+ROTOR_SPEED_BLOCK = named("motor.*_rpm", "m1 m2 m3 m4")
 STANDARD_BLOCKS: tuple[tuple[str, ...], ...] = (STATE_BLOCK, IMU_BLOCK, MOTOR_BLOCK)
 # Variables that a session logs.
 STATE_VARIABLES = STATE_BLOCK + tuple(f"stateEstimateZ.rate{a}" for a in ("Roll", "Pitch", "Yaw"))
