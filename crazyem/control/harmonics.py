@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.control.trajectories import Reference, Trajectory, Vector
+from crazyem.control.trajectories import Reference, Trajectory, Vector, reference_about, step_polynomials
 
 AXES = ("x", "y", "z", "yaw")
 
@@ -66,10 +66,7 @@ class Harmonics:
         ramp = min(self.ramp, self.duration / 2)
         rising = t <= self.duration / 2
         x = np.minimum(np.where(rising, t, self.duration - t) / ramp, 1.0)
-        w = np.array([
-            x**4 * (35 - 84 * x + 70 * x * x - 20 * x**3), 140 * x**3 * (1 - x) ** 3,
-            420 * x**2 * (1 - x) ** 2 * (1 - 2 * x), 840 * x * (1 - x) * (1 - 5 * x + 5 * x * x),
-        ])  # fmt: skip
+        w = np.array(step_polynomials(x))
         sign = np.where(rising, 1.0, np.array([1.0, -1.0, 1.0, -1.0])[:, None])
         slopes: NDArray[np.float64] = w * np.array([1.0, 1.0 / ramp, ramp**-2.0, ramp**-3.0])[:, None] * sign
         return slopes
@@ -87,15 +84,8 @@ class Harmonics:
         c, s = math.cos(yaw), math.sin(yaw)
 
         def at(t: float) -> Reference:
-            p, v, a, j = (self._turned(row, c, s) for row in self.derivatives(np.array([t]))[:, 0])
-            return Reference(
-                position=(position[0] + p[0], position[1] + p[1], position[2] + p[2]),
-                velocity=v[:3],
-                acceleration=a[:3],
-                jerk=j[:3],
-                yaw=yaw + p[3],
-                yaw_rate=v[3],
-            )
+            rows = self.derivatives(np.array([t]))[:, 0]
+            return reference_about(position, yaw, (self._turned(row, c, s) for row in rows))
 
         return Trajectory(name, self.duration, at)
 

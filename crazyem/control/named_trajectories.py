@@ -99,9 +99,8 @@ def waypoints(*, path: str | Path, position: Vector, yaw: float = 0.0) -> Trajec
     for r in rows:
         yaws.append(r.get("yaw", yaws[-1]))
     times = _times(points, rows, path)
-    rest = [(1, 0.0), (2, 0.0)]
     columns = np.column_stack([points, np.unwrap(yaws)])
-    ends = [(order, np.zeros(4)) for order, _ in rest]
+    ends = [(1, np.zeros(4)), (2, np.zeros(4))]  # at rest
     spline = make_interp_spline(times, columns, k=5, bc_type=(ends, ends))
     derivatives = [spline, spline.derivative(1), spline.derivative(2), spline.derivative(3)]
     duration = float(times[-1])
@@ -135,12 +134,11 @@ DEFAULT_HEIGHT = 1.0  # m above the take-off point, start of every named traject
 TrajectoryMaker = Callable[[Vector, float], Trajectory]  # arguments: position [m, world] and heading [rad] at the start
 
 
+_MAKERS: dict[str, Callable[..., Trajectory]] = {"hover": hover, "figure8": figure8, "excite": excite}
+
+
 def _made(name: str, position: Vector, yaw: float, duration: float) -> Trajectory:
-    if name == "hover":
-        return hover(position=position, yaw=yaw, duration=duration)
-    if name == "figure8":
-        return figure8(position=position, yaw=yaw, duration=duration)
-    return excite(position=position, yaw=yaw, duration=duration)
+    return _MAKERS[name](position=position, yaw=yaw, duration=duration)
 
 
 def trajectory_maker(words: Sequence[str], duration: float) -> TrajectoryMaker:
@@ -154,19 +152,17 @@ def trajectory_maker(words: Sequence[str], duration: float) -> TrajectoryMaker:
         UsageError: an unknown name or a missing file name. FileFormatError: the file cannot be used.
     """
     name, *rest = words
+    if name in ("waypoints", "plan") and len(rest) != 1:
+        raise UsageError(f"--trajectory {name} needs one FILE.")
     if name == "waypoints":
-        if len(rest) != 1:
-            raise UsageError("--trajectory waypoints needs one FILE.")
         read_waypoints(rest[0])  # report errors before the start
         return lambda position, yaw: waypoints(path=rest[0], position=position, yaw=yaw)
     if name == "informative" and not rest:
         raise UsageError("--trajectory informative is planned in flight, for one drone at a time.")
     if name == "plan":
-        if len(rest) != 1:
-            raise UsageError("--trajectory plan needs one FILE.")
         read = read_plan(rest[0])
         return lambda position, yaw: plan_trajectory(read, path=rest[0], position=position, yaw=yaw)
-    if name not in ("hover", "figure8", "excite") or rest:
+    if name not in _MAKERS or rest:
         raise UsageError(
             f"unknown trajectory '{' '.join(words)}' "
             "(hover, figure8, excite, informative, waypoints FILE, or plan FILE)."

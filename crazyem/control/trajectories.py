@@ -1,8 +1,9 @@
 """Reference trajectories as pure functions of time: hover, figure 8, and the excitation for the inertia."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 Vector = tuple[float, float, float]
 MAX_ACCELERATION = 8.0  # m/s^2; above, the thrust of a Crazyflie or the range of the setpoint is not enough
@@ -30,6 +31,19 @@ class Reference:
         return 0.0, 0.0, math.sin(self.yaw / 2), math.cos(self.yaw / 2)
 
 
+def reference_about(position: Vector, yaw: float, rows: Iterable[tuple[float, ...]]) -> Reference:
+    """The reference from displacement, velocity, acceleration, jerk (x, y, z, yaw) about `position` [m] and `yaw`."""
+    p, v, a, j = rows
+    return Reference(
+        position=(position[0] + p[0], position[1] + p[1], position[2] + p[2]),
+        velocity=(v[0], v[1], v[2]),
+        acceleration=(a[0], a[1], a[2]),
+        jerk=(j[0], j[1], j[2]),
+        yaw=yaw + p[3],
+        yaw_rate=v[3],
+    )
+
+
 def _never() -> bool:
     return False
 
@@ -51,18 +65,23 @@ class Trajectory:
     finished: Callable[[], bool] = _never
 
 
-def smooth_step(x: float) -> tuple[float, float, float, float]:
-    """A step from 0 to 1 over x in [0, 1]: value and first three derivatives by x, which are zero at both ends."""
-    if x <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0
-    if x >= 1.0:
-        return 1.0, 0.0, 0.0, 0.0
+def step_polynomials(x: Any) -> tuple[Any, Any, Any, Any]:
+    """`smooth_step` within [0, 1], of a number or an array."""
     return (
         x**4 * (35 - 84 * x + 70 * x * x - 20 * x**3),
         140 * x**3 * (1 - x) ** 3,
         420 * x**2 * (1 - x) ** 2 * (1 - 2 * x),
         840 * x * (1 - x) * (1 - 5 * x + 5 * x * x),
     )
+
+
+def smooth_step(x: float) -> tuple[float, float, float, float]:
+    """A step from 0 to 1 over x in [0, 1]: value and first three derivatives by x, which are zero at both ends."""
+    if x <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    if x >= 1.0:
+        return 1.0, 0.0, 0.0, 0.0
+    return step_polynomials(x)
 
 
 def window(t: float, *, duration: float, ramp: float) -> tuple[float, float, float, float]:
@@ -223,15 +242,7 @@ def excite(
         t = min(max(t, 0.0), duration)
         w = window(t, duration=duration, ramp=ramp)
         # Product rule: (w q)' = w'q + w q', and so on.
-        p, v, a, j = zip(*(_product(w, s.derivatives(t)) for s in sines))
-        return Reference(
-            position=(position[0] + p[0], position[1] + p[1], position[2] + p[2]),
-            velocity=(v[0], v[1], v[2]),
-            acceleration=(a[0], a[1], a[2]),
-            jerk=(j[0], j[1], j[2]),
-            yaw=yaw + p[3],
-            yaw_rate=v[3],
-        )
+        return reference_about(position, yaw, zip(*(_product(w, s.derivatives(t)) for s in sines)))
 
     return Trajectory("excite", duration, at)
 
