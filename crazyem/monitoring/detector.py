@@ -9,7 +9,6 @@ scales from before it opened, and parameters of slow errors from before the long
 
 import math
 from collections import deque
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from crazyem.estimation.model import Parameters
 from crazyem.monitoring import kernels
 from crazyem.monitoring.columns import NUISANCES, Columns, RowMaker
 from crazyem.monitoring.fault import Fault, Size
-from crazyem.monitoring.hypotheses import Hypothesis, hypotheses_for
+from crazyem.monitoring.hypotheses import hypotheses_for
 from crazyem.monitoring.slow_error import LAGS, slow_error
 from crazyem.monitoring.threshold import threshold_for
 from crazyem.vehicle import Vehicle
@@ -51,20 +50,13 @@ class Detector:
 
     Args:
         vehicle: its geometry. false_alarms_per_hour: of all hypotheses together.
-        hypotheses: possible changes; None: `hypotheses_for`.
 
     Attributes:
         holds: whether the model holds; False from a detection until the restarted tests are below their thresholds.
     """
 
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        *,
-        false_alarms_per_hour: float = 0.1,
-        hypotheses: Sequence[Hypothesis] | None = None,
-    ) -> None:
-        self.hypotheses = tuple(hypotheses or hypotheses_for(vehicle))
+    def __init__(self, vehicle: Vehicle, *, false_alarms_per_hour: float = 0.1) -> None:
+        self.hypotheses = hypotheses_for(vehicle)
         self.columns = Columns.of(self.hypotheses)
         self._maker = RowMaker(self.columns, vehicle)
         size, count = len(self.columns.columns), len(self.hypotheses)
@@ -276,8 +268,8 @@ class Detector:
         """
         near = np.ones(len(slots), bool)
         if self._found is not None:
-            near = np.abs(self.opened[slots] - self._found[1]) < NEAR_ONSET
-            near |= np.abs(self.opened[slots] - self._found[1]) <= np.abs(self.opened[slots] - self._found[1]).min()
+            away = np.abs(self.opened[slots] - self._found[1])
+            near = (away < NEAR_ONSET) | (away <= away.min())
         detected = now if self._found is None else self._found[0]
         at, k = np.unravel_index(int(np.argmax(np.where(near[:, None], statistic / scale, 0.0))), statistic.shape)
         noise = np.maximum(scale, scale[at, k]) + SIGNATURE_ERROR**2 * statistic[near].max()

@@ -17,11 +17,6 @@ HOUR = 3600.0  # s
 LARGEST = 1e4  # largest threshold of the statistic
 
 
-def overshoot(x: float) -> float:
-    """nu(x): mean of exp(-x R) for the overshoot R of a random walk, within a few per cent (Siegmund 1985)."""
-    return math.exp(-0.583 * x)
-
-
 def crossing_rate(threshold: float, freedom: int, shortest: float, longest: float) -> float:
     """Rate per sample at which the statistic (chi-square) crosses a threshold without a change.
 
@@ -30,7 +25,7 @@ def crossing_rate(threshold: float, freedom: int, shortest: float, longest: floa
     """
     b = math.sqrt(threshold)
     x = np.linspace(b / math.sqrt(longest), b / math.sqrt(shortest), 400)
-    integral = float(np.trapezoid(x * np.exp(-2 * 0.583 * x), x))
+    integral = float(np.trapezoid(x * np.exp(-2 * 0.583 * x), x))  # nu(x) = exp(-0.583 x), Siegmund 1985
     return threshold * float(chi2.pdf(threshold, freedom)) * integral
 
 
