@@ -10,7 +10,6 @@ import multiprocessing
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
-from typing import Protocol
 
 import numpy as np
 
@@ -55,17 +54,6 @@ def segment(request: Request) -> Harmonics | None:
     return plan.manoeuvre
 
 
-class Planner(Protocol):
-    """Interface of a planner of segments."""
-
-    def ask(self, request: Request) -> None: ...
-
-    def answer(self, timeout: float = 0.0) -> tuple[bool, Harmonics | None]:
-        """Whether there is an answer to the last request, and the answer."""
-
-    def close(self) -> None: ...
-
-
 class PlannerProcess:
     """A planner in a separate process, which ends with this process."""
 
@@ -80,6 +68,7 @@ class PlannerProcess:
         self._mine.send(request)
 
     def answer(self, timeout: float = 0.0) -> tuple[bool, Harmonics | None]:
+        """Whether there is an answer to the last request, and the answer."""
         try:
             if not self._mine.poll(timeout):
                 return False, None
@@ -129,7 +118,7 @@ class Informative:
         duration: float = 20.0,
         goal: float = GOAL,
         seed: int = 0,
-        planner: Planner | None = None,
+        planner: PlannerProcess | None = None,
     ) -> None:
         self.vehicle, self.limits = vehicle, limits or Limits()
         self.duration, self.goal, self.seed = duration, goal, seed

@@ -85,16 +85,13 @@ def fly_loop(wanted, dt, mass, inertia, lag, mixing, unmixing, most, kr, ki, kw,
             command[k, i] = min(max(u, 0.0), most)
             thrust[k, i] = f[i]
         # the body, with the mean of the lagged thrusts over the step
+        torque[:] = 0.0
         for i in range(4):
             after = command[k, i] + (f[i] - command[k, i]) * decay
             mean = command[k, i] + (f[i] - command[k, i]) * (1.0 - decay) * lag / dt
             f[i] = after
-            e_mean = mean
-            if i == 0:
-                for m in range(4):
-                    torque[m] = 0.0
             for m in range(4):
-                torque[m] += mixing[m, i] * e_mean
+                torque[m] += mixing[m, i] * mean
         bx, by, bz = 2 * (x * z + y * s), 2 * (y * z - x * s), 1 - 2 * (x * x + y * y)
         lift = torque[0] / mass
         acc[0], acc[1], acc[2] = bx * lift, by * lift, bz * lift - GRAVITY
