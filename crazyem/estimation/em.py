@@ -82,9 +82,8 @@ class WindowEM:
     def forward(self, first: int, last: int, *, restart: bool) -> float:
         """Filter rows first..last-1; with restart the tape holds the prior at `first`. Returns the log-likelihood."""
         t, p = self.tape, self.parameters
-        inertia = p.inertia
         return kernels.forward(
-            first, last, restart, t.time, t.kind, t.y, t.force, t.thrust, t.torque, p.theta[0], inertia, p.inverse,
+            first, last, restart, t.time, t.kind, t.y, t.force, t.thrust, t.torque, p.theta[0], p.inertia, p.inverse,
             p.noise.q, p.noise.r, p.noise.measurement[4] ** 2, self.setup.lead, START_VARIANCE, t.xp, t.pp, t.xf, t.pf,
             t.gain, t.s, t.e, t.blocks, t.middle, t.loglik,
         )  # fmt: skip
@@ -92,13 +91,18 @@ class WindowEM:
     def backward(self, first: int, last: int) -> None:
         """Smooth rows first..last-1 and fill their statistics."""
         t, p = self.tape, self.parameters
-        inertia = p.inertia
         kernels.backward(
             first, last, t.time, t.kind, t.usable, t.force, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
-            t.thrust_delay, t.torque_delay, p.theta[4], p.theta[5], p.theta[6:9], p.theta[0], inertia,
+            t.thrust_delay, t.torque_delay, p.theta[4], p.theta[5], p.theta[6:9], p.theta[0], p.inertia,
             p.inverse, p.noise.q, p.noise.r, p.noise.measurement[4] ** 2, self.setup.lead, t.xf, t.pf, t.gain, t.s,
             t.e, t.blocks, t.middle, t.stats, t.moments,
         )  # fmt: skip
+
+    def full_pass(self, first: int, last: int) -> None:
+        """Filter and smooth the window with the present parameters."""
+        self.refill_inputs(first, last)
+        self.forward(first, last, restart=True)
+        self.backward(first, last)
 
     def refill_inputs(self, first: int, last: int) -> None:
         """Recompute the mean inputs of the window with the present time constant and delay."""
@@ -113,16 +117,9 @@ class WindowEM:
         theta = self.parameters.theta.copy()
         if self._sums[kernels.COUNT] >= 3:
             maximise(
-                theta,
-                self.setup.unit,
-                self._sums,
-                self.setup.free,
-                prior.centre,
-                prior.precision,
-                self.setup.known_squares,
-                iterations,
-                self._squares,
-            )
+                theta, self.setup.unit, self._sums, self.setup.free, prior.centre, prior.precision,
+                self.setup.known_squares, iterations, self._squares,
+            )  # fmt: skip
             # the lag is linearised, so one step changes it by a quarter at most
             before = self.parameters.theta[4]
             theta[4] = min(1.25 * before, max(0.8 * before, theta[4]))
@@ -180,16 +177,15 @@ class WindowEM:
         noise, setup = self.parameters.noise, self.setup
         prior = setup.prior
         terms = self.noise_terms(first, last)
+        score = terms.sum(0) + (prior.noise.logs - noise.logs) / prior.noise_sd**2
         if of_noise is None:
             own = 2 * self.tape.stats[first:last, kernels.IMPULSE_SEEN : kernels.SIZE].sum(0)
-            information = np.maximum(own, long_run(terms - terms.mean(0))) + prior.noise_sd**-2
-            variance = 1.0 / information
-            score = terms.sum(0) + (prior.noise.logs - noise.logs) / prior.noise_sd**2
+            variance = 1.0 / (np.maximum(own, long_run(terms - terms.mean(0))) + prior.noise_sd**-2)
             step = score * variance
         else:
             covariance = np.linalg.inv(of_noise + np.eye(11) / prior.noise_sd**2)
             variance = np.diag(covariance)
-            step = covariance @ (terms.sum(0) + (prior.noise.logs - noise.logs) / prior.noise_sd**2)
+            step = covariance @ score
         step = np.maximum(noise.logs + np.clip(step, -1.5, 1.5), prior.floor) - noise.logs
         return np.where(setup.known_scales, 0.0, step), np.where(setup.known_scales, 0.0, np.sqrt(variance))
 
@@ -213,21 +209,19 @@ class WindowEM:
 
     def sensitivities(self, first: int, last: int) -> NDArray:
         """Information (9, 9) of theta from the means of the innovations; writes score rows; window must be filtered."""
-        t, p, setup = self.tape, self.parameters, self.setup
-        inertia = p.inertia
-        return kernels.sensitivities(
-            first, last, t.time, t.kind, t.usable, t.force, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
-            t.thrust_delay, t.torque_delay, p.theta, setup.unit, inertia, p.inverse, p.noise.q,
-            p.noise.measurement[4] ** 2, setup.lead, t.xf, t.gain, t.s, t.e, t.blocks, t.middle, t.score,
-        )  # fmt: skip
+        return kernels.sensitivities(*self._filtered(first, last), self.tape.score)
 
     def torque_sensitivities(self, first: int, last: int, shapes: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """For torques shapes (last, 3, K): information theta-sizes (9, K) and sizes (K, K), score of the sizes (K,)."""
+        return kernels.torque_sensitivities(*self._filtered(first, last), shapes)
+
+    def _filtered(self, first: int, last: int) -> tuple:
+        """The filtered window, as both kernels of sensitivities take it."""
         t, p, setup = self.tape, self.parameters, self.setup
-        return kernels.torque_sensitivities(
+        return (
             first, last, t.time, t.kind, t.usable, t.force, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
             t.thrust_delay, t.torque_delay, p.theta, setup.unit, p.inertia, p.inverse, p.noise.q,
-            p.noise.measurement[4] ** 2, setup.lead, t.xf, t.gain, t.s, t.e, t.blocks, t.middle, shapes,
+            p.noise.measurement[4] ** 2, setup.lead, t.xf, t.gain, t.s, t.e, t.blocks, t.middle,
         )  # fmt: skip
 
     def information(self, first: int, last: int, *, of_noise: NDArray | None = None) -> Information:
@@ -307,9 +301,7 @@ class WindowEM:
         parameters to which the returned information belongs.
         """
         for count in range(passes):
-            self.refill_inputs(first, last)
-            self.forward(first, last, restart=True)
-            self.backward(first, last)
+            self.full_pass(first, last)
             info = self.information(first, last)
             if info.noise_length > INEXACT_SCALE_SD:  # the diagonal approximation is too large for look-alike scales
                 info = self.information(first, last, of_noise=self.noise_information(first, last))
@@ -352,7 +344,6 @@ def _widen(covariance: NDArray, score: NDArray) -> tuple[NDArray, NDArray]:
 
     Real disturbances are not white, and onboard estimates have memory, so the plain covariance is too small.
     """
-    inflation = np.ones(len(covariance))
     scaled = score @ covariance
     scaled = scaled - scaled.mean(0)
     plain = np.sum(scaled**2, 0)

@@ -108,12 +108,10 @@ class InputHistory:
 
     def skip_to(self, time: float, tau: float, delay: float) -> None:
         """Move the lag's state to a time without a node (on the ground)."""
-        node = np.array([time])
-        scratch = np.zeros((1, 4))
+        node, unused = np.array([time]), np.zeros((3, 1, 4))
         self._at = lagged_means(
             self.times, self.wrenches, self._at, self.size, self.predictor, node, 0, 1, self.mode, tau, delay,
-            self.lag, scratch, scratch.copy(),
-            scratch.copy(),
+            self.lag, *unused,
         )  # fmt: skip
 
     def refill(self, tape: Tape, first: int, last: int, theta: NDArray) -> None:

@@ -65,11 +65,7 @@ class Marginal:
 def marginalise(em: WindowEM, first: int, last: int, best: Point, information: Information) -> Marginal | None:
     """Integrate out every noise scale that the data do not determine; None if there is none.
 
-    Args:
-        em: at the maximum, before and after; the window is left filtered and smoothed.
-        first, last: rows of the window.
-        best: the maximum.
-        information: at the maximum.
+    `em` is at the maximum `best`, before and after; the window first..last-1 is left filtered and smoothed.
     """
     weak = [j for j in MARGINAL_SCALES if best.sd[P + j] > WEAK_SCALE_SD]
     if not weak:

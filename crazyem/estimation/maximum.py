@@ -128,9 +128,7 @@ def maximise_posterior(em: WindowEM, first: int, last: int) -> Maximum:
     """Maximise the posterior over rows first..last-1 from the present parameters; the tape is left at the maximum."""
     path: list[PathPoint] = []
     while True:
-        em.refill_inputs(first, last)
-        em.forward(first, last, restart=True)
-        em.backward(first, last)
+        em.full_pass(first, last)
         there = em.information(first, last)
         length = max(there.decrement, there.noise_length)
         if len(path) == MOST_EM_MAPS or length < EM_BEYOND:
@@ -149,14 +147,9 @@ def maximise_posterior(em: WindowEM, first: int, last: int) -> Maximum:
             em.backward(first, last)
             length = em.information(first, last).decrement
         scoring_steps(
-            em,
-            first,
-            last,
-            steps=MOST_SCORING_STEPS,
-            tolerance=ROUGH_TOLERANCE,
-            path=path,
+            em, first, last, steps=MOST_SCORING_STEPS, tolerance=ROUGH_TOLERANCE, path=path,
             reused_within=REUSED_WITHIN_FAR,
-        )
+        )  # fmt: skip
         begin()
         best = scoring_steps(em, first, last, steps=MOST_SCORING_STEPS, tolerance=SCORING_TOLERANCE, path=path)
         if not path[-1].length < PASSED_SCORE_TEST:

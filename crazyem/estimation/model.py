@@ -1,32 +1,25 @@
 """Data classes of the estimator: parameter vector, noise scales, priors, setup; all frozen."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import UsageError
+from crazyem.estimation.result import PARAMETER_UNITS
 from crazyem.vehicle import GRAVITY, Vehicle
 
-NAMES = (
-    "mass",
-    "Ixx",
-    "Iyy",
-    "Izz",
-    "motor_time_constant",
-    "input_delay",
-    "torque_offset_x",
-    "torque_offset_y",
-    "torque_offset_z",
-)
+NAMES = tuple(PARAMETER_UNITS)
 GROUPS = ("position", "velocity", "attitude", "body_rate", "specific_force")
 
 
 # Rule of integration (`lead` in estimation/kernels). The midpoint rule is for real flights. The other two are exact for
 # simulators that use explicit Euler (as eq. 56 does) or semi-implicit Euler.
 INTEGRATION = {"midpoint": 0.5, "euler": 0.0, "semi-implicit": 1.0}
+# Smallest allowed noise scales, in the order of `Noise.logs`: far below the resolution of real sensors.
+SMALLEST_SCALES = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3, 5e-5, 1e-4, 1e-4, 1e-4, 1e-4])
 TINY_IMPULSE = 1e-7  # m/s^2 sqrt(s), rad/s^2 sqrt(s): stands for a process noise of zero
 
 
@@ -73,15 +66,12 @@ class Prior:
         sd: (9,) standard deviations of the logarithms, or of the linear parameters in their units.
         noise: centre of the prior of the noise scales.
         noise_sd: standard deviation of the logarithms of the noise scales.
-        impulse_floor, measurement_floor: smallest allowed scales (6,), (5,), far below the resolution of real sensors.
     """
 
     centre: NDArray
     sd: NDArray
     noise: Noise
     noise_sd: float = 1.5
-    impulse_floor: NDArray = field(default_factory=lambda: np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3]))
-    measurement_floor: NDArray = field(default_factory=lambda: np.array([5e-5, 1e-4, 1e-4, 1e-4, 1e-4]))
 
     @cached_property
     def precision(self) -> NDArray:
@@ -91,7 +81,7 @@ class Prior:
     @cached_property
     def floor(self) -> NDArray:
         """Logarithms of the smallest allowed scales (11,)."""
-        return np.log(np.concatenate([self.impulse_floor, self.measurement_floor]))
+        return np.log(SMALLEST_SCALES)
 
 
 @dataclass(frozen=True)
@@ -300,6 +290,6 @@ def setup_for(
     free = np.array([True, True, True, True, has_lag, timed, timed, timed, timed])
     offset = max(TRIM_SD * vehicle.mass * GRAVITY * max(vehicle.arm), 1e-9)
     unit = np.array([1.0, 1.0, 1.0, 1.0, 1.0, DELAY_UNIT, offset, offset, offset])
-    bare = Setup(Parameters(start, noise, vehicle.inertia_products), prior, free, unit)
-    setup = replace(bare, lead=INTEGRATION[integration], known=known_noise)
+    begin = Parameters(start, noise, vehicle.inertia_products)
+    setup = Setup(begin, prior, free, unit, INTEGRATION[integration], known_noise)
     return replace(setup, start=replace(setup.start, noise=setup.noise_at(start, noise.logs)))

@@ -143,9 +143,7 @@ def maximise(theta, unit, sums, free, centre, precision, known, iterations, squa
     """Newton's method with Levenberg damping from theta (9,: kernels.py), in place.
 
     Args:
-        theta: start, replaced by the maximum.
-        unit: (9,) units of the linear parameters.
-        sums: statistics summed over the window.
+        unit: (9,) units of the linear parameters. sums: statistics summed over the window.
         free: (9,) which parameters may move.
         centre, precision: (9,) prior: centre, and 1/sd^2 of the logarithm, or of the linear parameter in its unit.
         known: (5,) squares of the intensities of thrust, torque and lateral force that are known, 0 where profiled.

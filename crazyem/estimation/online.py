@@ -336,8 +336,7 @@ class OnlineEstimator:
         airborne = self._gate.update(height=float(node.y[2]), thrust=thrust, flying=self._flying)
         if not airborne:
             self.counters.grounded += 1
-            if not self._starts:
-                self._starts = True
+            self._starts = True
             if self._fresh == tape.size:
                 inputs.skip_to(node.time, tau, delay)
             return None

@@ -98,8 +98,6 @@ def point(
     """Score and information at the parameters with which the window was just filtered; smooths the window.
 
     Args:
-        em: tape and parameters.
-        first, last: rows of the window.
         value: result of `log_posterior`.
         of_noise: (11, 11) information on the noise scales; None: it is computed.
         held: (20,) bool, coordinates that are held fixed.
@@ -145,7 +143,6 @@ def scoring_steps(
     *,
     steps: int,
     tolerance: float,
-    of_noise: NDArray | None = None,
     held: NDArray = NOTHING_HELD,
     path: list[PathPoint] | None = None,
     reused_within: float = REUSED_WITHIN,
@@ -154,7 +151,7 @@ def scoring_steps(
 
     Returns the last point; the tape is left filtered and smoothed with it. Every point, the last one included, is added
     to `path`. The information on the noise scales is computed again once the log of one scale has changed by
-    `reused_within`. A given `of_noise` (11, 11) is used at all points.
+    `reused_within`.
     """
     path = [] if path is None else path
     begin = len(path)
@@ -162,8 +159,8 @@ def scoring_steps(
 
     def at(value: float) -> Point:
         nonlocal known
-        given = of_noise
-        if given is None and known is not None:
+        given = None
+        if known is not None:
             change = em.parameters.noise.logs - known.parameters.noise.logs
             given = known.of_noise if np.max(np.abs(change)) < reused_within else None
         there = point(em, first, last, value, of_noise=given, held=held)

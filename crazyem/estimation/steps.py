@@ -54,10 +54,7 @@ SHORTEST_WINDOW = 8  # samples
 class CumulativeSum:
     """Two-sided cumulative sum (Page, 1954); `add` returns the onset once a sum is beyond the threshold."""
 
-    def __init__(
-        self, *, drift: float = MEAN_TOLERANCE, threshold: float = STEP_THRESHOLD, most: float = LARGEST_INCREMENT
-    ) -> None:
-        self.drift, self.threshold, self.most = drift, threshold, most
+    def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
@@ -69,12 +66,12 @@ class CumulativeSum:
         """Add one normalised innovation at `time` [s]; NaN is ignored."""
         if not math.isfinite(value):
             return None
-        value = min(max(value, -self.most), self.most)
+        value = min(max(value, -LARGEST_INCREMENT), LARGEST_INCREMENT)
         for side, signed in enumerate((value, -value)):
             if self._sums[side] == 0.0:
                 self._since[side] = time
-            self._sums[side] = max(0.0, self._sums[side] + signed - self.drift)
-            if self._sums[side] > self.threshold:
+            self._sums[side] = max(0.0, self._sums[side] + signed - MEAN_TOLERANCE)
+            if self._sums[side] > STEP_THRESHOLD:
                 return self._since[side]
         return None
 
@@ -169,10 +166,6 @@ class StepAwareEstimator:
     @every.setter
     def every(self, samples: int) -> None:
         self.inner.every = samples
-
-    def share_computer(self, refresh: int) -> None:
-        """As `OnlineEstimator.share_computer`."""
-        self.inner.share_computer(refresh)
 
     @property
     def adapting(self) -> bool:

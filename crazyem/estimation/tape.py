@@ -11,79 +11,37 @@ START_VARIANCE = np.repeat([1.0, 1.0, 0.1, 25.0], 3)  # of the state at a break:
 class Tape:
     """Samples k = 0..size-1 and all quantities computed for them; row k of a step array is the step that ends at k."""
 
-    _ROWS = (
-        ("time", (), float),
-        ("y", (13,), float),
-        ("force", (3,), float),  # mean specific force over the step, body [m/s^2]; NaN where not measured
-        ("kind", (), np.int8),
-        ("usable", (), np.bool_),
-        ("mean", (4,), float),  # mean of lagged F and M over the step
-        ("mean_tau", (4,), float),
-        ("mean_delay", (4,), float),
-        ("thrust", (), float),
-        ("torque", (3,), float),
-        ("thrust_tau", (), float),
-        ("torque_tau", (3,), float),
-        ("thrust_delay", (), float),
-        ("torque_delay", (3,), float),
-        ("xp", (13,), float),
-        ("pp", (12, 12), float),
-        ("xf", (13,), float),
-        ("pf", (12, 12), float),
-        ("gain", (12, 12), float),
-        ("s", (12,), float),
-        ("e", (12,), float),
-        ("blocks", (5, 3, 3), float),
-        ("middle", (3, 3), float),
-        ("loglik", (), float),
-        ("stats", (kernels.SIZE,), float),
-        ("moments", (12,), float),
-        ("score", (kernels.PARAMETERS,), float),
-    )
-
     def __init__(self, capacity: int) -> None:
+        def rows(*shape: int, kind: type = float) -> np.ndarray:
+            return np.zeros((capacity, *shape), kind)
+
         self.capacity = capacity
         self.size = 0
-        for name, shape, kind in self._ROWS:
-            setattr(self, name, np.zeros((capacity, *shape), kind))
-
-    # for the type checker
-    time: np.ndarray
-    y: np.ndarray
-    force: np.ndarray
-    kind: np.ndarray
-    usable: np.ndarray
-    mean: np.ndarray
-    mean_tau: np.ndarray
-    mean_delay: np.ndarray
-    thrust: np.ndarray
-    torque: np.ndarray
-    thrust_tau: np.ndarray
-    torque_tau: np.ndarray
-    thrust_delay: np.ndarray
-    torque_delay: np.ndarray
-    xp: np.ndarray
-    pp: np.ndarray
-    xf: np.ndarray
-    pf: np.ndarray
-    gain: np.ndarray
-    s: np.ndarray
-    e: np.ndarray
-    blocks: np.ndarray
-    middle: np.ndarray
-    loglik: np.ndarray
-    stats: np.ndarray
-    moments: np.ndarray
-    score: np.ndarray
+        self.time = rows()
+        self.y = rows(13)
+        self.force = rows(3)  # mean specific force over the step, body [m/s^2]; NaN where not measured
+        self.kind = rows(kind=np.int8)
+        self.usable = rows(kind=np.bool_)
+        self.mean = rows(4)  # mean of lagged F and M over the step
+        self.mean_tau, self.mean_delay = rows(4), rows(4)
+        self.thrust, self.thrust_tau, self.thrust_delay = rows(), rows(), rows()
+        self.torque, self.torque_tau, self.torque_delay = rows(3), rows(3), rows(3)
+        self.xp, self.pp = rows(13), rows(12, 12)
+        self.xf, self.pf = rows(13), rows(12, 12)
+        self.gain, self.s, self.e = rows(12, 12), rows(12), rows(12)
+        self.blocks, self.middle = rows(5, 3, 3), rows(3, 3)
+        self.loglik = rows()
+        self.stats, self.moments = rows(kernels.SIZE), rows(12)
+        self.score = rows(kernels.PARAMETERS)
 
     def append(self, time: float, y: np.ndarray, *, starts: bool, keep: int) -> int:
         """Add a sample; a full tape keeps only its newest `keep` samples. Returns the number of dropped rows."""
         dropped = 0
         if self.size == self.capacity:
             dropped = self.size - keep
-            for name, _, _ in self._ROWS:
-                array = getattr(self, name)
-                array[:keep] = array[dropped : self.size].copy()
+            for array in vars(self).values():
+                if isinstance(array, np.ndarray):
+                    array[:keep] = array[dropped : self.size].copy()
             self.size = keep
         k = self.size
         self.time[k] = time
@@ -91,9 +49,7 @@ class Tape:
         self.force[k] = np.nan
         self.kind[k] = BREAK if starts or k == 0 else 0
         self.usable[k] = self.kind[k] == 0
-        self.mean[k] = 0.0
-        self.mean_tau[k] = 0.0
-        self.mean_delay[k] = 0.0
+        self.mean[k] = self.mean_tau[k] = self.mean_delay[k] = 0.0
         self.size += 1
         return dropped
 

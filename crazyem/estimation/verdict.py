@@ -33,12 +33,9 @@ def estimate_of(
     """The estimate: every parameter with its standard deviation, 95 % interval and verdict.
 
     Args:
-        parameters: present parameters of the estimator.
-        setup: prior, units, free parameters.
         information: of the last full pass.
         time: of the newest sample [s].
-        samples: number in the window.
-        updates: number so far.
+        samples, updates: number in the window, and so far.
         converged: whether the score test was passed.
         marginal: posterior with weakly determined noise scales integrated out; None: no such scale.
     """
