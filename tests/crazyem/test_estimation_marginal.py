@@ -8,7 +8,7 @@ import zhao_flight
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
-from test_estimation_scoring import FORCE, TORQUE, put, true_noise, window
+from test_estimation_scoring import FORCE, OFF, SENSOR_A, TORQUE, placed, true_noise
 
 from crazyem.estimation import initial_state
 from crazyem.estimation.em import Information
@@ -21,7 +21,7 @@ from crazyem.estimation.verdict import estimate_of
 from crazyem.vehicle import load_vehicle
 
 ZHAO = load_vehicle("zhao")
-MEASURED = ("position", "body_rate")
+ORDINARY = ("position", "velocity", "body_rate")
 
 
 def information(sd: float) -> Information:
@@ -80,9 +80,7 @@ def test_widening_for_correlation_is_kept():
 @pytest.mark.slow
 def test_the_integral_is_that_of_a_fine_grid_with_everything_refitted():
     """Thrust noise on 25 points of log s, all else converged at each, against the nodes and their quadratic steps."""
-    flight = zhao_flight.fly(seed=21)
-    em, n = window(flight), len(flight.time)
-    put(em, zhao_flight.TRUE, true_noise(FORCE, TORQUE))
+    em, n = placed(21)
     settled = maximise_posterior(em, 0, n)
     assert settled.marginal is not None
     assert settled.marginal.scales == (2,)
@@ -110,23 +108,18 @@ def test_the_integral_is_that_of_a_fine_grid_with_everything_refitted():
     assert settled.marginal.sd[0] > 0.7 * np.sqrt(settled.information.covariance[0, 0])
 
 
-def test_nothing_is_integrated_where_the_data_determine_the_noise():
-    flight = zhao_flight.fly(seed=22, force=0.005, torque=0.002)
-    em, n = window(flight, signals=("position", "velocity", "body_rate")), len(flight.time)
-    put(em, zhao_flight.TRUE, true_noise(0.005, 0.002))
-    assert maximise_posterior(em, 0, n).marginal is None
-
-
-def test_nothing_is_integrated_where_the_noise_is_known():
-    flight = zhao_flight.fly(seed=21, seconds=2.0)
-    em, n = window(flight, known=KnownNoise(force=FORCE, torque=TORQUE)), len(flight.time)
-    put(em, zhao_flight.TRUE, true_noise(FORCE, TORQUE))
+@pytest.mark.parametrize(
+    "settings",
+    [{"force": 0.005, "torque": 0.002, "signals": ORDINARY}, {"seconds": 2.0, "known": KnownNoise(FORCE, TORQUE)}],
+    ids=["determined by the data", "known"],
+)
+def test_nothing_is_integrated_where_the_noise_is(settings):
+    em, n = placed(22, **settings)
     assert maximise_posterior(em, 0, n).marginal is None
 
 
 def test_the_estimate_says_the_integrated_interval():
-    flight = zhao_flight.fly(seed=2, seconds=0.3)
-    em = window(flight)
+    em, _ = placed(2, seconds=0.3)
     marginal = Marginal(np.full(P, 0.01), np.full(P, 0.02), np.full(P, -0.03), np.full(P, 0.06), (2,))
     said = estimate_of(
         em.parameters, em.setup, information(0.01), time=0.0, samples=60, updates=1, converged=True, marginal=marginal
@@ -141,9 +134,7 @@ def test_the_estimate_says_the_integrated_interval():
 
 
 def test_refreshing_leaves_the_estimator_where_it_was():
-    flight = zhao_flight.fly(seed=23)
-    em, n = window(flight), len(flight.time)
-    put(em, zhao_flight.TRUE, true_noise(FORCE, TORQUE))
+    em, n = placed(23)
     info = em.converge(0, n, passes=30)
     best, state = em.parameters, em.tape.xf[n - 1].copy()
     value = log_posterior(em, 0, n, best)
@@ -168,7 +159,7 @@ def test_a_running_estimate_is_integrated_too_and_finish_agrees():
     flight = zhao_flight.fly(seed=24, seconds=6.0)
     estimator = OnlineEstimator(ZHAO, integration="euler")
     last = None
-    for sample in zhao_flight.samples(flight, MEASURED):
+    for sample in zhao_flight.samples(flight):
         last = estimator.feed(sample) or last
     assert last is not None
     assert estimator._marginal is not None
@@ -194,11 +185,10 @@ def test_intervals_cover(regime):
     known = KnownNoise(force=force, torque=torque, lateral_force=0.0) if regime == "known" else None
     errors, sds, hits, steps, conv = [], [], [], [], []
     for seed in range(SEEDS):
-        flight = zhao_flight.fly(seed=1000 + seed, seconds=2.5, force=force, torque=torque)
-        signals = MEASURED if quiet else ("position", "velocity", "body_rate")
-        em, n = window(flight, signals=signals, known=known), len(flight.time)
-        noise = true_noise(1.3 * force, 1.3 * torque)
-        put(em, zhao_flight.TRUE * [1.2, 0.7, 1.3, 0.7], noise)
+        em, n = placed(
+            1000 + seed, seconds=2.5, force=force, torque=torque, off=OFF, noise=true_noise(1.3 * force, 1.3 * torque),
+            signals=SENSOR_A if quiet else ORDINARY, known=known,
+        )  # fmt: skip
         settled = maximise_posterior(em, 0, n)
         estimate = estimate_of(
             em.parameters, em.setup, settled.information, time=0.0, samples=n, updates=1, converged=settled.converged,

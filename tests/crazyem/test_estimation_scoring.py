@@ -17,7 +17,7 @@ from crazyem.estimation import initial_state
 from crazyem.estimation.em import WindowEM, displaced
 from crazyem.estimation.inputs import InputHistory
 from crazyem.estimation.maximum import Maximum, maximise_posterior
-from crazyem.estimation.model import NAMES, KnownNoise, Noise, Parameters, setup_for
+from crazyem.estimation.model import NAMES, SMALLEST_SCALES, KnownNoise, Noise, Parameters, setup_for
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.estimation.scoring import (
     COORDINATES,
@@ -70,6 +70,17 @@ def put(em: WindowEM, theta: np.ndarray, noise: Noise) -> Parameters:
     return em.parameters
 
 
+def placed(
+    seed: int, *, seconds: float = 4.0, force: float = FORCE, torque: float = TORQUE, off: np.ndarray | float = 1.0,
+    noise: Noise | None = None, **settings
+) -> tuple[WindowEM, int]:  # fmt: skip
+    """A flight on a tape with its number of rows, placed at the truth times `off`, by default with the true noise."""
+    flight = zhao_flight.fly(seed=seed, seconds=seconds, force=force, torque=torque)
+    em = window(flight, **settings)
+    put(em, zhao_flight.TRUE * off, noise or true_noise(force, torque))
+    return em, len(flight.time)
+
+
 KNOWN = KnownNoise(force=FORCE, torque=TORQUE, lateral_force=3e-4)
 
 
@@ -77,10 +88,10 @@ KNOWN = KnownNoise(force=FORCE, torque=TORQUE, lateral_force=3e-4)
 @pytest.mark.parametrize("signals", [SENSOR_A, (*SENSOR_A, "specific_force"), ("position", "velocity", "attitude")])
 def test_the_score_is_the_slope_of_the_posterior(known, signals):
     """In every free coordinate, parameters and noise scales, off the maximum; in standard deviations."""
-    flight = zhao_flight.fly(seed=2, seconds=1.5)
-    em = window(flight, signals=signals, known=known)
-    n = len(flight.time)
-    start = put(em, zhao_flight.TRUE * [1.01, 0.97, 1.03, 0.98], Noise(*(1.3 * s for s in _scales())))
+    em, n = placed(
+        2, seconds=1.5, off=np.array([1.01, 0.97, 1.03, 0.98]), noise=too_much(), signals=signals, known=known
+    )
+    start = em.parameters
     with initial_state.known_initial_state(em, 0, n):  # with an attitude known to 20 degrees only, no filter is linear
         here = point(em, 0, n, log_posterior(em, 0, n, start))
         for i in np.flatnonzero(here.free):
@@ -92,9 +103,10 @@ def test_the_score_is_the_slope_of_the_posterior(known, signals):
             assert here.score[i] * sd == pytest.approx(slope * sd, abs=0.1, rel=0.02), i  # an extended filter
 
 
-def _scales():
+def too_much(factor: float = 1.3) -> Noise:
+    """The true noise times `factor`; more along x and y, where there is none."""
     noise = true_noise(FORCE, TORQUE)
-    return noise.impulse * [30, 30, 1, 1, 1, 1], noise.measurement
+    return Noise(factor * noise.impulse * [30, 30, 1, 1, 1, 1], factor * noise.measurement)
 
 
 def test_known_scales_are_not_free_and_follow_mass_and_inertia():
@@ -139,14 +151,19 @@ def test_unknown_integration_is_refused():
             build()
 
 
+def with_accelerometer(flight, *, wanted=True):
+    """The estimator after a flight with accelerometer."""
+    estimator = OnlineEstimator(ZHAO, integration="euler", accelerometer=wanted, every=10**9)
+    for sample in zhao_flight.samples(flight, (*SENSOR_A, "specific_force")):
+        estimator.feed(sample)
+    estimator.finish()
+    return estimator
+
+
 def test_an_accelerometer_is_used_only_if_asked_for():
     flight = zhao_flight.fly(seed=3, seconds=0.5)
     for wanted in (False, True):
-        estimator = OnlineEstimator(ZHAO, integration="euler", accelerometer=wanted, every=10**9)
-        for sample in zhao_flight.samples(flight, (*SENSOR_A, "specific_force")):
-            estimator.feed(sample)
-        estimator.finish()
-        tape = estimator._tape
+        tape = with_accelerometer(flight, wanted=wanted)._tape
         seen = ~np.isnan(tape.force[: tape.size])
         assert seen[1:].all() if wanted else not seen.any()
         if wanted:
@@ -156,10 +173,7 @@ def test_an_accelerometer_is_used_only_if_asked_for():
 def test_an_accelerometer_out_of_its_range_is_a_missing_one():
     flight = zhao_flight.fly(seed=3, seconds=0.5)
     flight.force[20, 1] = 5e3
-    estimator = OnlineEstimator(ZHAO, integration="euler", accelerometer=True, every=10**9)
-    for sample in zhao_flight.samples(flight, (*SENSOR_A, "specific_force")):
-        estimator.feed(sample)
-    estimator.finish()
+    estimator = with_accelerometer(flight)
     assert np.isnan(estimator._tape.force[20]).tolist() == [False, True, False]
     assert estimator.counters.missing == 1
 
@@ -180,9 +194,7 @@ def test_short_steps_stay_what_they_are():
 
 def settled_from_afar(seed: int) -> tuple[Maximum, np.ndarray]:
     """A window with little process noise, begun 30 % off in parameters and scales; its end, errors in sds (4,)."""
-    flight = zhao_flight.fly(seed=seed)
-    em, n = window(flight), len(flight.time)
-    put(em, zhao_flight.TRUE * OFF, Noise(*(1.3 * s for s in _scales())))
+    em, n = placed(seed, off=OFF, noise=too_much())
     settled = maximise_posterior(em, 0, n)
     sd = np.sqrt(np.diag(settled.information.covariance))[:4]
     return settled, np.log(em.parameters.theta[:4] / zhao_flight.TRUE) / sd
@@ -200,9 +212,7 @@ def test_settles_from_thirty_per_cent_off(seed):
 
 def test_the_end_is_a_maximum():
     """Half a standard deviation off in any free coordinate is not better; in the parameters the fall is half of 1/4."""
-    flight = zhao_flight.fly(seed=4)
-    em, n = window(flight), len(flight.time)
-    put(em, zhao_flight.TRUE, Noise(*_scales()))
+    em, n = placed(4, noise=too_much(1.0))
     end = scoring_steps(em, 0, n, steps=25, tolerance=0.02)
     for i in np.flatnonzero(end.free):
         for sign in (0.5, -0.5):
@@ -214,9 +224,7 @@ def test_the_end_is_a_maximum():
 
 
 def test_no_step_loses_what_it_must_not():
-    flight = zhao_flight.fly(seed=5, seconds=2.0)
-    em, n = window(flight), len(flight.time)
-    put(em, zhao_flight.TRUE * OFF, true_noise(0.1, 0.1))
+    em, n = placed(5, seconds=2.0, off=OFF, noise=true_noise(0.1, 0.1))
     values = [log_posterior(em, 0, n, em.parameters)]
     for _ in range(12):
         values.append(scoring_steps(em, 0, n, steps=1, tolerance=0.0).value)
@@ -245,12 +253,11 @@ def test_known_noise_reaches_its_bound_and_the_bound_is_lower():
 
 def test_em_with_known_noise_ends_where_scoring_ends():
     """Two ways to one maximum: the M-step with fixed scales in newtons, and the chain rule through the noise score."""
-    flight = zhao_flight.fly(seed=7, seconds=3.0, force=0.005, torque=0.002)
     known = KnownNoise(
         force=0.005, torque=0.002, lateral_force=0.0, position=7.07e-3, velocity=7.07e-3, body_rate=7.07e-2
     )
-    em, n = window(flight, signals=("position", "velocity", "body_rate"), known=known), len(flight.time)
-    put(em, zhao_flight.TRUE, true_noise(0.005, 0.002))
+    signals = ("position", "velocity", "body_rate")
+    em, n = placed(7, seconds=3.0, force=0.005, torque=0.002, signals=signals, known=known)
     for _ in range(60):
         em.forward(0, n, restart=True)
         em.backward(0, n)
@@ -264,9 +271,7 @@ def test_em_with_known_noise_ends_where_scoring_ends():
 
 
 def test_the_smoothed_start_is_that_of_rauch_tung_striebel():
-    flight = zhao_flight.fly(seed=8, seconds=0.4)
-    em, n = window(flight), len(flight.time)
-    put(em, zhao_flight.TRUE, true_noise(FORCE, TORQUE))
+    em, n = placed(8, seconds=0.4)
     t, p = em.tape, em.parameters
     with initial_state.known_initial_state(em, 0, n):  # so that nothing is far from linear
         em.forward(0, n, restart=True)
@@ -325,11 +330,11 @@ def test_settling_reports_its_way():
 
 
 def test_points_are_displaced_as_theta_is():
-    em = window(zhao_flight.fly(seed=2, seconds=0.3))
-    start = put(em, zhao_flight.TRUE, true_noise(FORCE, TORQUE))
+    em, _ = placed(2, seconds=0.3)
+    start = em.parameters
     step = np.zeros(COORDINATES)
     step[:4] = 0.1, -0.2, 0.3, 0.05
     there = moved(em, start, step)
     np.testing.assert_array_equal(there.theta, displaced(start.theta, step[:P], em.setup.unit))
     low = moved(em, replace(start, noise=Noise.from_logs(start.noise.logs)), -100 * np.eye(COORDINATES)[P + 2])
-    assert low.noise.impulse[2] == pytest.approx(em.setup.prior.impulse_floor[2])
+    assert low.noise.impulse[2] == pytest.approx(SMALLEST_SCALES[2])
