@@ -16,7 +16,6 @@ from errata_tools import (
     Iy,
     Iz,
     R,
-    axis,
     derivative,
     dt,
     flights,
@@ -46,12 +45,6 @@ pytestmark = pytest.mark.slow  # about the paper: no code of ours but its plant 
 
 def _angles(seed: int = 0, n: int = 20) -> np.ndarray:
     return np.random.default_rng(seed).uniform([-1.2, -1.2, -3.0], [1.2, 1.2, 3.0], (n, 3))
-
-
-def _rate_numbers(angles, body_rate):
-    out = np.empty(3)
-    plant.angle_rates(np.asarray(angles, float), np.asarray(body_rate, float), out)
-    return out
 
 
 # -- II.B: state space ------------------------------------------------------------------------------------------------
@@ -277,9 +270,6 @@ def test_79_continuous_matrices_are_not_a_discrete_model():
     assert np.allclose(exact.A, nilpotent)
     assert np.allclose(exact.B, held)
     assert not np.allclose(a @ x + b @ u, nilpotent @ x + held @ u, rtol=0.1)
-    # the code's gains are those of the discrete model
-    gains, _, _ = ct.dlqr(nilpotent[np.ix_([0, 3], [0, 3])], held[[0, 3]][:, :1], np.diag([16.0, 4.0]), np.eye(1))
-    assert np.allclose(lqg.position_gains(dt=DT, position_weight=16.0, velocity_weight=4.0), gains[0])
 
 
 def test_appendix_a_the_row_of_roll_has_its_one_in_the_wrong_column():
@@ -316,14 +306,6 @@ def test_right_8_to_17_flatness():
     assert zero(R[2, 2] / sp.cos(theta) - sp.cos(phi))
     assert zero(R[1, 0] / sp.cos(theta) - sp.sin(psi))
     assert zero(R[0, 0] / sp.cos(theta) - sp.cos(psi))
-    rng = np.random.default_rng(1)
-    angles = np.empty(3)
-    for acceleration in rng.normal(size=(20, 3)) * 3:
-        yaw = rng.uniform(-3, 3)
-        specific = lqg.reference_angles(acceleration, yaw, angles)
-        assert np.allclose(specific * axis(angles), acceleration + np.array([0, 0, GRAVITY]))  # 8, 11, 14
-        x_axis = rotation_matrix(quaternion_from_euler(*angles))[:, 0]
-        assert np.arctan2(x_axis[1], x_axis[0]) == pytest.approx(yaw)  # 9, 10, 12
 
 
 def test_right_20_21_47_rates_of_the_angles():
@@ -331,7 +313,6 @@ def test_right_20_21_47_rates_of_the_angles():
     rates, error = np.empty(3), np.array([0.1, -0.2, 0.3])
     for angles in _angles(3):
         lqg.reference_rate(angles, angles + error, 1.0, rates)  # 20
-        assert np.allclose(_rate_numbers(angles, rates), error)
         assert np.allclose(rates, np.array(PRINTED_21.subs(dict(zip((phi, theta), angles[:2]))), float) @ error)
 
 
@@ -352,13 +333,6 @@ def test_right_49_84_110_euler():
     )
     assert zero(alpha - printed)
     assert zero((rate + alpha * dt) - (rate + printed * dt))  # 108
-    u, x = np.empty(4), np.zeros(12)
-    x[9:] = [1.0, -2.0, 3.0]
-    lqg.control(x, np.zeros(9), 0.0, np.array([4.0, 4.0, 20.0, 20.0]), 9.0, MASS, INERTIA, u)
-    wanted = np.empty(3)
-    lqg.reference_rate(x[6:9], np.zeros(3), 20.0, wanted)
-    commanded = -20.0 * (x[9:] - wanted)
-    assert np.allclose(u[1:], INERTIA * commanded + np.cross(x[9:], INERTIA * x[9:]))  # 84
 
 
 def test_right_101_vertical_component_of_48():
