@@ -9,7 +9,6 @@ import synthetic
 
 from crazyem.errors import FileFormatError
 from crazyem.estimation.online import OnlineEstimator
-from crazyem.physics.lag import CAUSAL, hold_predictor, lagged_means
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import load_vehicle, parse_vehicle
 
@@ -62,15 +61,3 @@ def test_commands_stamped_between_the_measurements_under_noisy_control():
         p = estimator.finish()["Ixx"]
         hits += p.ci95[0] <= 2e-5 <= p.ci95[1]
     assert hits >= 6, hits  # 5 of 8 or fewer has probability 0.006 at 95 %
-
-
-def test_causal_state_is_blind_too():
-    t, node, out = np.arange(6) * 0.01, np.array([0.028, 0.038]), []
-    for future in (0.0, 1.0):
-        u = np.zeros((6, 4))
-        u[3, 0] = future  # stamped 30 ms, after the step that begins at 28 ms
-        mean, state = np.zeros((2, 4)), np.zeros(13)
-        slopes = np.zeros((2, 4)), np.zeros((2, 4))
-        lagged_means(t, u, 0, 6, hold_predictor(), node, 0, 2, CAUSAL, 0.06, 0.003, state, mean, *slopes)
-        out.append(mean[1, 0])
-    assert out[0] == pytest.approx(out[1], abs=1e-9), out
