@@ -143,10 +143,6 @@ def test_thrust_scale_is_parallel_to_mass_and_inertia() -> None:
     other = motion(situation, vehicle=lighter, effects={})
     assert scaled.specific_force == pytest.approx(other.specific_force)
     assert scaled.angular_acceleration == pytest.approx(other.angular_acceleration)
-    told = plan(VEHICLE, parameters=("mass", "thrust_scale"))
-    assert told.manoeuvre is None
-    assert "parallel" in str(told)
-    assert "weigh" in str(told)
 
 
 # limits and the search
@@ -345,7 +341,9 @@ def test_the_command_says_why_no_manoeuvre_will_do(tmp_path: Path, capsys: pytes
     output, summary = tmp_path / "plan.toml", tmp_path / "plan.json"
     code = cli.main(["plan", "--for", "mass,thrust_scale", "-o", str(output), "--json", str(summary)])
     assert code == 5
-    assert "parallel" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "parallel" in said
+    assert "weigh" in said
     assert not output.exists()
     assert json.loads(summary.read_text())["possible"] is False
 
