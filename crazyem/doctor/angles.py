@@ -19,7 +19,8 @@ from crazyem.doctor.kinematics import (
     track,
     width_for,
 )
-from crazyem.doctor.regression import Choice, Slope, blocks, choose, slope
+from crazyem.doctor.regression import Choice, blocks, choose, slope
+from crazyem.doctor.streams import runs
 from crazyem.physics.rotations import euler_from_quaternion, rotate
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
@@ -57,10 +58,9 @@ def check(recording: Recording) -> list[Finding]:
         # a quaternion of the same origin first: one of another origin may have another heading, and a lag
         ordered = sorted(sound, key=lambda other: origin_of(other) != origin_of(name))
         for other in ordered:
-            finding, told = _euler(name, array, other, sound[other])
-            if finding is not None:
-                found.append(finding)
-            if told:
+            findings = _euler(name, array, other, sound[other])
+            if findings is not None:
+                found += findings
                 break
     return found
 
@@ -74,22 +74,16 @@ def reading(array: SignalArray, name: str) -> SignalArray:
 
 def _quaternion(name: str, array: SignalArray, recording: Recording) -> Finding | None:
     """Finding if another reading of a quaternion than the declared one agrees with the gyro and with gravity."""
-    turns = _by_rate(array, recording)
     upright = _by_gravity(array, recording)
     declared = next(iter(READINGS))
-    chosen = turns[0] if turns else ""
-    evidence: dict[str, float] = {}
-    if turns and turns[0] != declared:
-        evidence |= turns[1]
-        if upright and upright[turns[0]] < 0.9 and upright[declared] > 0.95:
-            return None  # gravity supports the declared reading; the gyro may be wrong
-    elif not turns and upright and upright[declared] < 0.5:
+    chosen, evidence = _by_rate(array, recording)
+    if chosen and upright and upright[chosen] < 0.9 and upright[declared] > 0.95:
+        return None  # gravity supports the declared reading; the gyro may be wrong
+    if not chosen and upright and upright[declared] < 0.5:
         # too little rotation: gravity does not depend on the heading, so it shows the order only
-        chosen = max(upright, key=lambda reading_name: (round(upright[reading_name], 3), -READINGS[reading_name][0]))
+        chosen = max(upright, key=lambda key: (round(upright[key], 3), -READINGS[key][0]))
         if upright[chosen] < 0.9:
             return None
-    else:
-        return None
     if chosen in ("", declared):
         return None
     if upright:
@@ -101,12 +95,10 @@ def _quaternion(name: str, array: SignalArray, recording: Recording) -> Finding 
     return Finding("angles", Grade.UNUSABLE, text, name, (), evidence, advice, fix)
 
 
-def _by_rate(array: SignalArray, recording: Recording) -> tuple[str, dict[str, float]] | None:
-    """The reading whose derivative agrees with the gyro, and evidence; None if the data do not decide."""
+def _by_rate(array: SignalArray, recording: Recording) -> tuple[str, dict[str, float]]:
+    """The reading whose derivative agrees with the gyro ("" if the data do not decide), and evidence."""
     for gyro in measurements(recording, "body_rate").values():
         grid = grid_of(array, gyro)
-        if grid.size == 0:
-            continue
         window = Window(max(0.24, width_for(array, gyro)))
         smooth = {key: window.mean(rate_of_attitude(track(reading(array, key), grid))) for key in READINGS}
         raw = track(gyro, grid)
@@ -125,14 +117,16 @@ def _by_rate(array: SignalArray, recording: Recording) -> tuple[str, dict[str, f
         choice = choose(measured.value[rows], candidates, blocks(grid.time[rows]))
         if choice is None or not choice.name or choice.explained[choice.best] < 0.6:
             continue
-        declared = next(iter(READINGS))
-        numbers = {
-            "explained": choice.explained[choice.name],
-            "explained_as_declared": choice.explained[declared],
-            "unexplained_ratio": choice.ratio,
-        }
-        return choice.name, numbers
-    return None
+        return choice.name, _explained(choice)
+    return "", {}
+
+
+def _explained(choice: Choice) -> dict[str, float]:
+    return {
+        "explained": choice.explained[choice.name or choice.best],
+        "explained_as_declared": next(iter(choice.explained.values())),
+        "unexplained_ratio": choice.ratio,
+    }
 
 
 def _by_gravity(array: SignalArray, recording: Recording) -> dict[str, float] | None:
@@ -154,85 +148,75 @@ def _by_gravity(array: SignalArray, recording: Recording) -> dict[str, float] | 
     return None
 
 
-def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -> tuple[Finding | None, bool]:
-    """A finding, if any, and whether the data allow a judgement."""
+def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -> list[Finding] | None:
+    """Findings; None if the data allow no judgement."""
     grid = grid_of(array, quaternion)
-    if grid.size == 0:
-        return None, False
     window = Window(max(0.1, width_for(array, quaternion) / 2))
-    expected = _unwrapped(quaternion)
-    truth = track(expected, grid)
+    truth = track(_unwrapped(quaternion), grid)
     straight = _continuous_angles(array)
     late = delay(window.mean(truth), window.mean(track(straight, grid)), reach=0.15)
     lag = late.value if late is not None and not late.at_edge and late.explained > 0.5 else 0.0
     x, y = window.mean(truth), window.mean(track(straight, grid, shift=lag))
     rows = np.flatnonzero(_upright(track(quaternion, grid), x.valid & y.valid))[::3]
     if rows.size < 100:
-        return None, False
+        return None
     block = blocks(grid.time[rows])
     straight_x, straight_y = _unit_variance(x.value[rows]), _unit_variance(y.value[rows])
     # an angle that hardly moves is noise, so it is no evidence
     excited = x.value[rows].std(axis=0) >= LEAST_ANGLE_RMS
     alike = np.abs(straight_x.T @ straight_y) / rows.size
-    told: NDArray[np.bool_] = np.any(alike > LEAST_CORRELATION, axis=0)
-    if not (excited & told).any():
-        return None, False
-    ways = _orders(straight_x, told)
-    choice = choose(straight_y * told, ways, block)
+    known: NDArray[np.bool_] = np.any(alike > LEAST_CORRELATION, axis=0)
+    if not (excited & known).any():
+        return None
+    ways = _orders(straight_x, known)
+    choice = choose(straight_y * known, ways, block)
     if choice is None or choice.explained[choice.best] < 0.8:
-        return None, False
+        return None
     if choice.denied and choice.name:
         # each angle must agree by itself: noise has a sign, too
         match = (ways[choice.name][1] * straight_y).mean(axis=0)
-        if not (match[told] > LEAST_CORRELATION).all():
-            return None, False
-    known = [i for i in range(3) if excited[i] and told[i]]
-    parts = {ANGLE_NAMES[i]: slope(x.value[rows, i], y.value[rows, i], block) for i in known}
-    evidence = {
-        "explained": choice.explained[choice.name or choice.best],
-        "explained_as_declared": choice.explained["as declared"],
-        "unexplained_ratio": choice.ratio,
-        "lag_ms": 1e3 * lag,
-    }
-    evidence |= {f"slope_{key}": s.value for key, s in parts.items() if s is not None}
-    return _euler_finding(name, f"{name} against {other}: ", choice, parts, evidence), True
+        if not (match[known] > LEAST_CORRELATION).all():
+            return None
+    columns = np.flatnonzero(excited & known)
+    slopes = {ANGLE_NAMES[i]: slope(x.value[rows, i], y.value[rows, i], block) for i in columns}
+    parts = {key: s.value for key, s in slopes.items() if s is not None}
+    evidence = {**_explained(choice), "lag_ms": 1e3 * lag, **{f"slope_{key}": s for key, s in parts.items()}}
+    return _euler_findings(name, f"{name} against {other}: ", choice, parts, evidence)
 
 
-def _euler_finding(
-    name: str, head: str, choice: Choice, parts: Mapping[str, Slope | None], evidence: dict[str, float]
-) -> Finding | None:
-    """Finding by the best reading of Euler angles: an inverted sign, another order or unit; None if there is none."""
+def _euler_findings(
+    name: str, head: str, choice: Choice, parts: Mapping[str, float], evidence: dict[str, float]
+) -> list[Finding]:
+    """Finding by the best reading of Euler angles: an inverted sign, another order or unit."""
     if choice.denied:
         what = choice.name.removeprefix("as declared ")
         factor = axes.sign_factor(what, ANGLE_NAMES) if choice.name else None
         if factor is not None:
             turned = " and ".join(ANGLE_NAMES[i] for i in range(3) if factor[i] < 0)
             text = f"{head}the sign of {turned} is inverted."
-            unit = _unit_of([s.value * factor[ANGLE_NAMES.index(k)] for k, s in parts.items() if s is not None])
+            unit = _unit_of([s * factor[ANGLE_NAMES.index(key)] for key, s in parts.items()])
             scale = 1.0 / ANGLE_UNITS[unit] if unit else 1.0
             text = text if not unit else text[:-1] + f", and it is {_unit_said(unit)}."
             fix = Fix("scale", (name,), tuple(f * scale for f in factor))
-            return Finding("angles", Grade.UNUSABLE, text, name, (), evidence, "Correct its sign.", fix)
+            return [Finding("angles", Grade.UNUSABLE, text, name, (), evidence, "Correct its sign.", fix)]
         said = f"its components are {what}" if choice.name else "it does not agree, and why cannot be told"
         advice = "Correct the order of its components where it is read."
-        return Finding("angles", Grade.UNUSABLE, f"{head}{said}.", name, (), evidence, advice)
-    unit = _unit_of([s.value for s in parts.values() if s is not None])
+        return [Finding("angles", Grade.UNUSABLE, f"{head}{said}.", name, (), evidence, advice)]
+    unit = _unit_of(list(parts.values()))
     if not unit:
-        return None
+        return []
     text = f"{head}it is {_unit_said(unit)}."
     fix = Fix("scale", (name,), (1.0 / ANGLE_UNITS[unit],) * 3)
-    return Finding("angles", Grade.UNUSABLE, text, name, (), evidence, "Correct its unit.", fix)
+    return [Finding("angles", Grade.UNUSABLE, text, name, (), evidence, "Correct its unit.", fix)]
 
 
 def _upright(attitude: Track, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(m,) True in the longest stretch in which roll and pitch are far from the jumps of Euler angles."""
     angles = np.abs(euler_from_quaternion(attitude.value))
     far = (angles[:, 0] < LARGEST_ANGLES[0]) & (angles[:, 1] < LARGEST_ANGLES[1]) | ~attitude.valid
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], far, [False]]).astype(np.int8)))
     out = np.zeros(valid.size, bool)
-    if edges.size:
-        longest = int(np.argmax(edges[1::2] - edges[::2]))
-        out[edges[2 * longest] : edges[2 * longest + 1]] = True
+    first, last = max(runs(far), key=np.ptp, default=(0, 0))
+    out[first:last] = True
     return out & valid
 
 
@@ -241,12 +225,12 @@ def _unit_variance(value: Array) -> Array:
     return np.asarray((value - value.mean(axis=0)) / np.where(spread > 1e-12, spread, np.inf), float)
 
 
-def _orders(x: Array, told: NDArray[np.bool_]) -> dict[str, tuple[int, Array]]:
-    """Hypotheses of signs, and of the order yaw, pitch, roll; components that are not `told` are zero."""
+def _orders(x: Array, known: NDArray[np.bool_]) -> dict[str, tuple[int, Array]]:
+    """Hypotheses of signs, and of the order yaw, pitch, roll; components that are not `known` are zero."""
     out = {}
     for key, (cost, value) in axes.signed("as declared", x, ANGLE_NAMES).items():
         if cost <= 2 or [part.lstrip("-") for part in key.split(" ")[-3:]] == ["yaw,", "pitch,", "roll"]:
-            out[key] = (cost, value * told)
+            out[key] = (cost, value * known)
     return out
 
 
@@ -273,11 +257,9 @@ def _unwrapped(quaternion: SignalArray) -> SignalArray:
 
 def _continuous_angles(array: SignalArray) -> SignalArray:
     """The array without jumps of a whole turn, in any unit: the range of yaw suggests the size of a turn."""
-    largest = float(np.abs(array.value).max())
+    largest, turn = float(np.abs(array.value).max()), 360.0
     if largest <= 1.001 * math.pi / DEGREES:
         turn = 2.0 * math.pi / DEGREES
     elif largest <= 1.001 * 2.0 * math.pi:
         turn = 2.0 * math.pi
-    else:
-        turn = 360.0
     return replace(array, value=np.unwrap(array.value, axis=0, period=turn))

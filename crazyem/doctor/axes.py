@@ -69,19 +69,15 @@ def scale_fault(whole: Slope | None, single: Sequence[Slope | None], least: floa
         single: of each component.
         least: deviation from 1 that matters.
     """
-    off = [s is not None and _off(s, least) for s in single]
-    together = whole is not None and _off(whole, least)
+    known = [s for s in single if s is not None]
     # one factor for all, if no component contradicts it
-    if (
-        together
-        and whole is not None
-        and all(s is None or (s.low <= whole.high and s.high >= whole.low) for s in single)
-    ):
+    if whole is not None and _off(whole, least) and all(s.low <= whole.high and s.high >= whole.low for s in known):
         return ScaleFault(f"its scale is {_said(whole)}", (1.0 / whole.value,) * len(single))
-    if not any(off):
+    off = {i: s for i, s in enumerate(single) if s is not None and _off(s, least)}
+    if not off:
         return None
-    said = [f"{_AXIS_NAMES[i]} {_said(s)}" for i, s in enumerate(single) if off[i] and s is not None]
-    repair = tuple(1.0 / s.value if o and s is not None else 1.0 for o, s in zip(off, single, strict=True))
+    said = [f"{_AXIS_NAMES[i]} {_said(s)}" for i, s in off.items()]
+    repair = tuple(1.0 / off[i].value if i in off else 1.0 for i in range(len(single)))
     return ScaleFault("its scale is " + ", ".join(said), repair)
 
 

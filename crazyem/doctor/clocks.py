@@ -79,12 +79,13 @@ def _order(stream: Stream) -> list[Finding]:
 
 
 def _wrap(stream: Stream, rows: NDArray[np.int64], span: float, words: str, period: float) -> Finding:
-    at = [(float(stream.time[i - 1]), float(stream.time[i - 1])) for i in rows]
-    step = float(np.median(stream.time[rows] - stream.time[rows - 1])) + span
+    last = stream.time[rows - 1]
+    step = float(np.median(stream.time[rows] - last)) + span
     text = f"{stream.name}: the clock overflows {len(rows)} times and starts again from zero: a counter of {words}."
     evidence = {"wraps": len(rows), "wrap_s": span, "step_across_s": step, "period_s": period}
-    fix = Fix("unwrap", stream.names, factor=(span,) * len(rows), rows=rows.astype(np.int64))
-    return Finding("clocks", Grade.DEGRADES, text, sole(stream.names), longest(at), evidence, "Unwrap it (--fix).", fix)
+    fix = Fix("unwrap", stream.names, factor=(span,) * len(rows), rows=rows)
+    spans = longest(zip(last, last))
+    return Finding("clocks", Grade.DEGRADES, text, sole(stream.names), spans, evidence, "Unwrap it (--fix).", fix)
 
 
 def _restart(stream: Stream, rows: NDArray[np.int64]) -> Finding:
@@ -95,7 +96,7 @@ def _restart(stream: Stream, rows: NDArray[np.int64]) -> Finding:
     )
     evidence = {"jumps": len(rows), "largest_s": float(back.max()), "first_row": int(rows[0]) + 1}
     advice = "Write a file for each part and use these as recordings of their own."
-    spans = longest((float(stream.time[i + 1]), float(stream.time[i])) for i in rows)
+    spans = longest(zip(stream.time[rows + 1], stream.time[rows]))
     return Finding("clocks", Grade.UNUSABLE, text, sole(stream.names), spans, evidence, advice)
 
 
@@ -107,7 +108,7 @@ def _late(stream: Stream, rows: NDArray[np.int64], *, clean: bool) -> Finding:
     )
     evidence = {"records": int(rows.size), "share": share, "largest_s": float(back.max())}
     advice = "Sort by stamp (--fix)." if clean else "Deal with the jumps of the clock first."
-    spans = longest((float(stream.time[i + 1]), float(stream.time[i])) for i in rows)
+    spans = longest(zip(stream.time[rows + 1], stream.time[rows]))
     fix = Fix("sort", stream.names) if clean else None
     return Finding("clocks", Grade.DEGRADES, text, sole(stream.names), spans, evidence, advice, fix)
 
@@ -119,19 +120,14 @@ def _twice(stream: Stream, rows: NDArray[np.int64]) -> Finding:
         alike &= ((before == after) | (np.isnan(before) & np.isnan(after))).all(axis=1)
     share = rows.size / stream.time.size
     copies = int(alike.sum())
-    all_copies = copies == rows.size
+    values = "the same values" if copies == rows.size else f"{rows.size - copies} of them with other values"
+    text = f"{stream.name}: {rows.size} records ({percent(share)}) carry the stamp of the record before, {values}."
+    spans = longest(zip(stream.time[rows], stream.time[rows]))
+    evidence = {"records": int(rows.size), "share": share, "copies": copies}
+    advice = "Mark the copies as missing (--fix)." if copies else "Their time is known to one step of the clock only."
+    fix = Fix("mark", stream.names, rows=rows[alike] + 1) if copies else None
     grade = Grade.DEGRADES if share > 0.01 else Grade.HARMLESS
-    return Finding(
-        "clocks",
-        grade,
-        f"{stream.name}: {rows.size} records ({percent(share)}) carry the stamp of the record before, "
-        + ("with the same values." if all_copies else f"{rows.size - copies} of them with other values."),
-        sole(stream.names),
-        longest((float(stream.time[i]), float(stream.time[i])) for i in rows),
-        {"records": int(rows.size), "share": share, "copies": copies},
-        "Mark the copies as missing (--fix)." if copies else "Their time is known to one step of the clock only.",
-        Fix("mark", stream.names, rows=rows[alike].astype(np.int64) + 1) if copies else None,
-    )
+    return Finding("clocks", grade, text, sole(stream.names), spans, evidence, advice, fix)
 
 
 # -- rate -------------------------------------------------------------------------------------------------------------
@@ -174,8 +170,7 @@ def _claimed(metadata: Mapping[str, Mapping[str, str]], stream: str, real: float
 
 def _rate_finding(nominal: float, real: float, names: list[str]) -> Finding:
     percent = 100.0 * (real / nominal - 1.0)
-    wrong = abs(percent) > 100.0 * WRONG_RATE_DEVIATION
-    grade = Grade.DEGRADES if wrong else Grade.HARMLESS
+    grade = Grade.DEGRADES if abs(percent) > 100.0 * WRONG_RATE_DEVIATION else Grade.HARMLESS
     text = (
         f"{listed(names)}: really {real:.4g} Hz, {abs(percent):.2f} % {'faster' if percent > 0 else 'slower'} than "
         f"{nominal:g} Hz."
@@ -202,31 +197,22 @@ def _arrivals(stream: Stream) -> tuple[Column, Column, NDArray[np.int64]] | None
 
 def _jumps(stream: Stream, time: Column, offset: Column, rows: NDArray[np.int64]) -> Iterator[Finding]:
     # the delay of a late packet passes, a jump of the clock stays: so samples before and after are compared
-    candidates = np.flatnonzero(np.abs(np.diff(offset)) > CLOCK_JUMP)
-    sizes = []
-    for i in candidates[:1000]:
-        before, after = offset[max(0, i - 20) : i + 1], offset[i + 1 : i + 41]
-        # packets in a queue arrive late, never early: so the earliest arrivals show the clocks
-        size = float(after.min() - before.min())
-        if abs(size) > CLOCK_JUMP:
-            sizes.append((int(i), size))
-    if not sizes:
+    candidates = np.flatnonzero(np.abs(np.diff(offset)) > CLOCK_JUMP)[:1000]
+    # packets in a queue arrive late, never early: so the earliest arrivals show the clocks
+    sizes = np.array([offset[i + 1 : i + 41].min() - offset[max(0, i - 20) : i + 1].min() for i in candidates])
+    jumps = np.abs(sizes) > CLOCK_JUMP
+    if not jumps.any():
         return
-    worst = max(sizes, key=lambda pair: abs(pair[1]))
-    forward = worst[1] < 0
+    at, sizes = candidates[jumps], sizes[jumps]
+    worst = float(sizes[np.argmax(np.abs(sizes))])
     text = (
-        f"{stream.name}: the drone's clock jumps {len(sizes)} times against the host's, at most by "
-        f"{abs(worst[1]):.3f} s {'ahead' if forward else 'back'}."
+        f"{stream.name}: the drone's clock jumps {at.size} times against the host's, at most by "
+        f"{abs(worst):.3f} s {'ahead' if worst < 0 else 'back'}."
     )
     advice = "Take the jumps out (--fix), or use a part between them (--from, --to)."
-    spans = longest((float(time[i]), float(time[i + 1])) for i, _ in sizes)
-    fix = Fix(
-        "unwrap",
-        stream.names,
-        factor=tuple(size for _, size in sizes),
-        rows=np.array([rows[i + 1] for i, _ in sizes], np.int64),
-    )
-    yield Finding("clocks", Grade.DEGRADES, text, "", spans, {"jumps": len(sizes), "largest_s": -worst[1]}, advice, fix)
+    spans = longest(zip(time[at], time[at + 1]))
+    fix = Fix("unwrap", stream.names, tuple(sizes.tolist()), rows[at + 1])
+    yield Finding("clocks", Grade.DEGRADES, text, "", spans, {"jumps": at.size, "largest_s": -worst}, advice, fix)
 
 
 def _drift(time: Column, offset: Column, *, several: bool) -> Iterator[Finding]:
@@ -241,7 +227,7 @@ def _drift(time: Column, offset: Column, *, several: bool) -> Iterator[Finding]:
     x, y = time[picks], offset[picks]
     line, covariance = np.polyfit(x - x.mean(), y, 1, cov=True)
     slope = float(line[0])
-    deviation = 2.1 * float(np.sqrt(covariance[0, 0]))  # 95 % of Student's t at 18 degrees of freedom
+    deviation = 2.1 * math.sqrt(covariance[0, 0])  # 95 % of Student's t at 18 degrees of freedom
     apart = abs(slope) * duration
     if abs(slope) < 2.0 * deviation or apart < 0.005 or abs(slope) < 2e-5:
         return

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor.kinematics import GRID_STEP, Track
+from crazyem.doctor.regression import jackknife_error
 
 Array = NDArray[np.float64]
 
@@ -19,17 +20,11 @@ FEWEST_CORRELATION_ROWS = 45  # fewest rows of the grid in a correlation
 
 @dataclass(frozen=True, slots=True)
 class Delay:
-    """Lag of the second track behind the first.
+    """Lag of the second track behind the first."""
 
-    Attributes:
-        value: s; positive where the second is late.
-        explained: share of the variance of the second track that the first explains at this lag.
-        at_edge: the best lag is at the end of the range, so there is no maximum inside.
-    """
-
-    value: float
-    explained: float
-    at_edge: bool
+    value: float  # s; positive where the second is late
+    explained: float  # share of the variance of the second track that the first explains at this lag
+    at_edge: bool  # the best lag is at the end of the range, so there is no maximum inside
 
 
 def delay(first: Track, second: Track, *, reach: float = LARGEST_LAG, mixed: bool = True) -> Delay | None:
@@ -54,24 +49,18 @@ def delay(first: Track, second: Track, *, reach: float = LARGEST_LAG, mixed: boo
         curve[k] = _explained(first, second, int(steps[k]), mixed)
     top = int(np.nanargmax(curve))
     edge = top in (0, steps.size - 1) or not np.isfinite(curve[top - 1 : top + 2]).all()
-    if edge:
-        return Delay(float(steps[top]) * GRID_STEP, float(curve[top]), True)
-    place = float(steps[top]) - 1.0 + _peak(curve[top - 1 : top + 2])
-    return Delay(place * GRID_STEP, float(curve[top]), False)
+    place = float(steps[top])
+    if not edge:
+        place = place - 1.0 + _peak(curve[top - 1 : top + 2])
+    return Delay(place * GRID_STEP, float(curve[top]), edge)
 
 
 def _explained(first: Track, second: Track, steps: int, mixed: bool) -> float:
     """Share of the variance of second(t) that first(t - steps) explains; NaN with too few common rows."""
-    m = len(first.value)
-    a, b = max(0, -steps), max(0, steps)
-    n = m - abs(steps)
-    stride = max(2, n // MOST_CORRELATION_ROWS)
-    good = first.valid[a : a + n : stride] & second.valid[b : b + n : stride]
-    count = int(np.count_nonzero(good))
+    x, y, _ = _common(first, second, steps)
+    count = len(x)
     if count < FEWEST_CORRELATION_ROWS:
         return math.nan
-    x = first.value[a : a + n : stride][good]
-    y = second.value[b : b + n : stride][good]
     one = np.full(count, 1.0 / count)
     mx, my = one @ x, one @ y
     sxx = x.T @ x / count - np.outer(mx, mx)
@@ -86,6 +75,16 @@ def _explained(first: Track, second: Track, steps: int, mixed: bool) -> float:
     else:
         got = float((np.diag(sxy) ** 2 / np.maximum(np.diag(sxx), 1e-300)).sum())
     return got / whole
+
+
+def _common(first: Track, second: Track, steps: int) -> tuple[Array, Array, NDArray[np.int64]]:
+    """first(t - steps) and second(t), (n, c) each, at every second valid row t or fewer, and these rows (n,)."""
+    n = len(first.value) - abs(steps)
+    a, b = max(0, -steps), max(0, steps)
+    stride = max(2, n // MOST_CORRELATION_ROWS)
+    good = first.valid[a : a + n : stride] & second.valid[b : b + n : stride]
+    x, y = first.value[a : a + n : stride][good], second.value[b : b + n : stride][good]
+    return x, y, np.arange(b, b + n, stride)[good]
 
 
 def spread(first: Track, second: Track, found: Delay, block_rows: int) -> tuple[float, int]:
@@ -107,23 +106,16 @@ def spread(first: Track, second: Track, found: Delay, block_rows: int) -> tuple[
     peaks = np.array([_peak(_share(total - sums[:, b])) for b in range(count)]) * GRID_STEP
     if peaks.min() <= 0.0 or peaks.max() >= 2 * JACKKNIFE_REACH * GRID_STEP:
         return math.inf, count
-    return float(np.sqrt((count - 1) / count * np.square(peaks - peaks.mean()).sum())), count
+    return float(jackknife_error(peaks)), count
 
 
 def _block_sums(first: Track, second: Track, steps: int, block_rows: int) -> Array:
     """(blocks, 6, c) sums of 1, x, y, xx, xy, yy of x = first(t - steps), y = second(t), by blocks of t."""
-    m = len(first.value)
-    a, b = max(0, -steps), max(0, steps)
-    n = m - abs(steps)
-    stride = max(2, n // MOST_CORRELATION_ROWS)
-    at = np.arange(b, b + n, stride)
-    good = first.valid[a : a + n : stride] & second.valid[at]
-    x, y, block = first.value[a : a + n : stride][good], second.value[at][good], (at // block_rows)[good]
-    blocks = -(-m // block_rows)
-    parts = [np.ones_like(x), x, y, x * x, x * y, y * y]
-    return np.array(
-        [[np.bincount(block, weights=p[:, c], minlength=blocks) for c in range(x.shape[1])] for p in parts]
-    ).transpose(2, 0, 1)
+    x, y, rows = _common(first, second, steps)
+    block, blocks = rows // block_rows, -(-len(first.value) // block_rows)
+    parts = (np.ones_like(x), x, y, x * x, x * y, y * y)
+    sums = [[np.bincount(block, weights=column, minlength=blocks) for column in part.T] for part in parts]
+    return np.array(sums).transpose(2, 0, 1)
 
 
 def _share(sums: Array) -> Array:

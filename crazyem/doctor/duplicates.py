@@ -8,7 +8,7 @@ offsets. Setpoints are left out: they are equal in different flights.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -44,60 +44,28 @@ _IGNORED_SIGNALS = ("setpoint", "sp_", "ctrltarget", "ref")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fingerprint:
-    """Hashes by which a flight is recognised.
+    """Hashes by which a flight is recognised."""
 
-    Attributes:
-        path: of the recording.
-        start_s, end_s: of its time axis.
-        hashes: (n,), see the module.
-        times: (n,) s, the time of each hash.
-    """
-
-    path: str
-    start_s: float
+    path: str  # of the recording
+    start_s: float  # of its time axis
     end_s: float
-    hashes: Hashes
-    times: Array
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {
-            "path": self.path,
-            "start_s": self.start_s,
-            "end_s": self.end_s,
-            "hashes": self.hashes.tolist(),
-            "times": self.times.tolist(),
-        }
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "Fingerprint":
-        """Inverse of `to_dict`."""
-        hashes, times = np.array(data["hashes"], np.uint32), np.array(data["times"], float)
-        return cls(str(data["path"]), float(data["start_s"]), float(data["end_s"]), hashes, times)
+    hashes: Hashes  # (n,), see the module
+    times: Array  # (n,) s, the time of each hash
 
 
 @dataclass(frozen=True, slots=True)
 class Duplicate:
-    """Two recordings of one flight.
+    """Two recordings of one flight."""
 
-    Attributes:
-        first, second: paths, the longer recording first.
-        overlap_s: length of the common stretch.
-        offset_s: time in the second recording less time in the first, at one instant.
-        share_first, share_second: common share of each recording.
-        start_s, end_s: of the common stretch, on the time axis of the first.
-        matches: number of common hashes.
-    """
-
-    first: str
+    first: str  # path of the longer recording
     second: str
-    overlap_s: float
-    offset_s: float
-    share_first: float
+    overlap_s: float  # length of the common stretch
+    offset_s: float  # time in the second recording less time in the first, at one instant
+    share_first: float  # common share of the first recording
     share_second: float
-    start_s: float
+    start_s: float  # of the common stretch, on the time axis of the first
     end_s: float
-    matches: int
+    matches: int  # number of common hashes
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -112,24 +80,16 @@ class Duplicate:
         else:
             what = f"{self.second} and {self.first} have a part in common"
         text = f"{what}: {self.overlap_s:.1f} s, {self.offset_s:+.3f} s apart on their time axes."
-        evidence = {
-            "overlap_s": self.overlap_s,
-            "offset_s": self.offset_s,
-            "share_first": self.share_first,
-            "share_second": self.share_second,
-            "matches": self.matches,
-        }
+        names = ("overlap_s", "offset_s", "share_first", "share_second", "matches")
+        evidence = {name: getattr(self, name) for name in names}
         advice = "Use one of them only: as two they count one flight twice, in training and test they leak."
         return Finding("duplicate", Grade.DEGRADES, text, "", ((self.start_s, self.end_s),), evidence, advice)
 
 
 def fingerprint(recording: Recording) -> Fingerprint:
     """The fingerprint of a recording; empty without noisy measurements, and then it matches nothing."""
-    hashes, times = [np.zeros(0, np.uint32)], [np.zeros(0)]
-    for time, value in _channels(recording):
-        h, t = _numbers(time, value)
-        hashes.append(h)
-        times.append(t)
+    none = (np.zeros(0, np.uint32), np.zeros(0))
+    hashes, times = zip(none, *(_numbers(time, value) for time, value in _channels(recording)))
     hashed, at = np.concatenate(hashes), np.concatenate(times)
     stamps = [a.time[np.isfinite(a.time)] for a in recording.signals.values()]
     stamps = [t for t in stamps if t.size]
@@ -145,7 +105,7 @@ def fingerprint(recording: Recording) -> Fingerprint:
     return Fingerprint(recording.path, start, end, hashed, at)
 
 
-def find_duplicates(fingerprints: Sequence[Fingerprint] | Iterable[Fingerprint]) -> list[Duplicate]:
+def find_duplicates(fingerprints: Iterable[Fingerprint]) -> list[Duplicate]:
     """Pairs of recordings of one flight, the longest common stretch first.
 
     Each of several copies is paired with the longest one only.
@@ -166,29 +126,25 @@ def find_duplicates(fingerprints: Sequence[Fingerprint] | Iterable[Fingerprint])
 
 def _channels(recording: Recording) -> list[tuple[Array, Array]]:
     """Times (n,) and values (n,) of the channels to use, known measurements first."""
-    names = sorted(recording.signals, key=lambda name: _rank(name, recording.signals[name]))
     chosen: list[tuple[Array, Array]] = []
-    for name in names:
-        array = recording.signals[name]
-        low = name.lower()
-        if any(low.startswith(word) or f".{word}" in low for word in _IGNORED_SIGNALS) or array.quantity.startswith(
-            "setpoint"
-        ):
-            continue
-        found = sound_samples(array)
+    for name, array in sorted(recording.signals.items(), key=lambda item: _rank(*item)):
+        low = f".{name.lower()}"
+        ignored = array.quantity.startswith("setpoint") or any(f".{word}" in low for word in _IGNORED_SIGNALS)
+        found = None if ignored else sound_samples(array)
         if found is None or found[0].size < 8 * TURNING_POINT_NEIGHBOURS:
             continue
-        for column in found[1].T:
-            if len(chosen) >= (_CHANNELS_LARGE if found[0].size > _LARGE_CHANNEL_ROWS else _CHANNELS):
+        time, value = found
+        for column in value.T:
+            if len(chosen) >= (_CHANNELS_LARGE if time.size > _LARGE_CHANNEL_ROWS else _CHANNELS):
                 return chosen
-            chosen.append((found[0], column))
+            chosen.append((time, column))
     return chosen
 
 
 def _rank(name: str, array: SignalArray) -> tuple[int, str]:
     quantity = array.quantity
     place = _PREFERRED_SIGNALS.index(quantity) if quantity in _PREFERRED_SIGNALS else len(_PREFERRED_SIGNALS)
-    return (2 * place + ("@" in name), name)
+    return 2 * place + ("@" in name), name
 
 
 def _numbers(time: Array, value: Array) -> tuple[Hashes, Array]:
@@ -199,9 +155,8 @@ def _numbers(time: Array, value: Array) -> tuple[Hashes, Array]:
         return np.zeros(0, np.uint32), np.zeros(0)
     size = 2 * TURNING_POINT_NEIGHBOURS + 1
     turning = (value == maximum_filter1d(value, size)) | (value == minimum_filter1d(value, size))
-    turning[:TURNING_POINT_NEIGHBOURS] = turning[-TURNING_POINT_NEIGHBOURS:] = (
-        False  # an extreme at an end may be none in a longer copy
-    )
+    # an extreme at an end may be none in a longer copy
+    turning[:TURNING_POINT_NEIGHBOURS] = turning[-TURNING_POINT_NEIGHBOURS:] = False
     t, v = time[turning], value[turning]
     if t.size < 3:
         return np.zeros(0, np.uint32), np.zeros(0)
@@ -259,13 +214,9 @@ def _votes(prints: Sequence[Fingerprint]) -> dict[tuple[int, int], Array]:
     distance = times[b] - times[a]
     place = np.argsort(pair, kind="stable")
     pair, distance = pair[place], distance[place]
-    edges = np.flatnonzero(np.append(True, pair[1:] != pair[:-1])) if pair.size else np.zeros(0, int)
-    ends = np.append(edges[1:], pair.size)
-    return {
-        divmod(int(pair[i]), len(prints)): np.sort(distance[i:j])
-        for i, j in zip(edges, ends)
-        if j - i >= FEWEST_COMMON_HASHES
-    }
+    pairs, edges = np.unique(pair, return_index=True)
+    parts = zip(pairs, np.split(distance, edges[1:]))
+    return {divmod(int(p), len(prints)): np.sort(part) for p, part in parts if part.size >= FEWEST_COMMON_HASHES}
 
 
 def _judge(first: Fingerprint, second: Fingerprint, distances: Array) -> Duplicate | None:
@@ -291,17 +242,9 @@ def _judge(first: Fingerprint, second: Fingerprint, distances: Array) -> Duplica
     if not high > low or matched.size < LEAST_COMMON_SHARE * inside.sum():
         return None
     length = high - low
-    return Duplicate(
-        first=first.path,
-        second=second.path,
-        overlap_s=length,
-        offset_s=offset,
-        share_first=min(length / max(first.end_s - first.start_s, 1e-9), 1.0),
-        share_second=min(length / max(second.end_s - second.start_s, 1e-9), 1.0),
-        start_s=low,
-        end_s=high,
-        matches=int(matched.size),
-    )
+    share_first, share_second = (min(length / max(one.end_s - one.start_s, 1e-9), 1.0) for one in (first, second))
+    paths = (first.path, second.path)
+    return Duplicate(*paths, length, offset, share_first, share_second, low, high, int(matched.size))
 
 
 def _matches(first: Fingerprint, second: Fingerprint, offset: float) -> tuple[Array, Array]:
@@ -319,7 +262,5 @@ def _matches(first: Fingerprint, second: Fingerprint, offset: float) -> tuple[Ar
     for side in (near - 1, near):
         at = np.clip(side, 0, max(hashes.size - 1, 0))
         hit |= (hashes[at] == keys[0]) & (np.abs(times[at] - first.times) < TIME_TOLERANCE)
-    poorer = first.times if first.times.size / max(first.end_s - first.start_s, 1.0) <= second.times.size / max(
-        second.end_s - second.start_s, 1.0
-    ) else second.times - offset  # fmt: skip
-    return first.times[hit], poorer
+    rates = [one.times.size / max(one.end_s - one.start_s, 1.0) for one in (first, second)]
+    return first.times[hit], first.times if rates[0] <= rates[1] else second.times - offset

@@ -1,7 +1,7 @@
 """Extremes of the motion of a recording while the drone was in the air."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -38,28 +38,17 @@ class Envelope:
     voltage_min_V: float | None = None
     motor_command_max: float | None = None
     motor_saturated_share: float | None = None
-    airborne_intervals_s: tuple[tuple[float, float], ...] = field(default=())
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
+    airborne_intervals_s: tuple[tuple[float, float], ...] = ()
 
 
 def envelope(recording: Recording, air: Airtime) -> Envelope:
     """Extremes of the airborne part, of samples as measured: one outlier is enough to set an extreme."""
-    found: dict[str, Any] = {}
-    speed = _speed(recording, air)
-    if speed is not None:
-        found["speed_from"], velocity = speed
-        norm = np.linalg.norm(velocity, axis=1)
-        found["speed_max_m_s"], found["speed_rms_m_s"] = float(norm.max()), float(np.sqrt(np.mean(norm**2)))
-        found |= _range("vertical_speed_{}_m_s", velocity[:, 2])
-        del speed, velocity, norm  # of a long flight, one signal at a time
+    found = _speeds(recording, air)
     for name, extremes in _EXTREMES.items():
-        value = inside_of(recording, name, air)
+        value = _in_the_air(recording, name, air)
         if value is not None and not (name == "euler" and "tilt_from" in found):
             found |= extremes(value)
-        del value
+        del value  # of a long flight, one signal at a time
     return Envelope(air.seconds, air.judged_by, airborne_intervals_s=air.flown, **found)
 
 
@@ -98,35 +87,41 @@ _EXTREMES: dict[str, Callable[[Array], dict[str, Any]]] = {
 }
 
 
-def inside_of(recording: Recording, name: str, air: Airtime) -> Array | None:
+def sound_signal(recording: Recording, name: str) -> tuple[Array, Array] | None:
+    """Times (n,) and values (n, c) of the samples that are numbers, in order of time; None if there are none."""
+    array = recording.signals.get(name)
+    return None if array is None else sound_samples(array)
+
+
+def _in_the_air(recording: Recording, name: str, air: Airtime) -> Array | None:
     """(n, c) sound samples of a signal in the air, None if there are none."""
-    found = _sound(recording, name)
+    found = sound_signal(recording, name)
     if found is None:
         return None
     value = found[1][air.covers(found[0])]
     return value if value.size else None
 
 
-def _sound(recording: Recording, name: str) -> tuple[Array, Array] | None:
-    """Times (n,) and values (n, c) of the samples that are numbers, in order of time; None if there are none."""
-    array = recording.signals.get(name)
-    return None if array is None else sound_samples(array)
+def _speeds(recording: Recording, air: Airtime) -> dict[str, Any]:
+    """Extremes of the velocity in the air, or of differences of the position."""
+    source, velocity = "velocity", _in_the_air(recording, "velocity", air)
+    if velocity is None:
+        source, velocity = "position", _differences(recording, air)
+    if velocity is None:
+        return {}
+    norm = np.linalg.norm(velocity, axis=1)
+    extremes = {"speed_max_m_s": float(norm.max()), "speed_rms_m_s": float(np.sqrt(np.mean(norm**2)))}
+    return {"speed_from": source, **extremes, **_range("vertical_speed_{}_m_s", velocity[:, 2])}
 
 
-def _speed(recording: Recording, air: Airtime) -> tuple[str, Array] | None:
-    """The signal that gives the velocity, and (n, 3) m/s in the air."""
-    velocity = inside_of(recording, "velocity", air)
-    if velocity is not None:
-        return "velocity", velocity
-    found = _sound(recording, "position")
+def _differences(recording: Recording, air: Airtime) -> Array | None:
+    """Velocity (n, 3) [m/s] in the air by differences of the position; None if there are none."""
+    found = sound_signal(recording, "position")
     if found is None:
         return None
     time, position = found
-    later = np.searchsorted(time, time + _SPEED_SPAN)
-    whole = (later < time.size) & air.covers(time)
-    whole &= air.covers(time[np.minimum(later, time.size - 1)])
-    whole &= time[np.minimum(later, time.size - 1)] - time < 2.0 * _SPEED_SPAN
-    if not whole.any():
-        return None
-    span = time[later[whole]] - time[whole]
-    return "position", (position[later[whole]] - position[whole]) / span[:, None]
+    row = np.searchsorted(time, time + _SPEED_SPAN)
+    later = np.minimum(row, time.size - 1)
+    span = time[later] - time
+    whole = (row < time.size) & air.covers(time) & air.covers(time[later]) & (span < 2.0 * _SPEED_SPAN)
+    return (position[later] - position)[whole] / span[whole, None] if whole.any() else None

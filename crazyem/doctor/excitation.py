@@ -15,9 +15,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.regression import AUTOREGRESSION_ORDER, Fit, autoregression, filtered, long_run
+from crazyem.doctor.kinematics import turn
+from crazyem.doctor.regression import AUTOREGRESSION_ORDER, Fit, autoregression, filtered, long_run, widened
 from crazyem.physics.lag import CAUSAL, LINEAR, fit_predictor, hold_predictor, lagged_means
-from crazyem.physics.rotations import quaternion_conjugate, quaternion_product, rotation_vector_from_quaternion
 from crazyem.recordings.airborne import Airtime
 from crazyem.recordings.thrust import Inputs
 from crazyem.vehicle import GRAVITY, Vehicle
@@ -71,9 +71,8 @@ def steps_of(time: Array, value: Array, air: Airtime) -> Steps | None:
         pieces = _sampled(pieces, total)
     if not pieces:
         return None
-    return Steps(
-        tuple(t for t, _ in pieces), tuple(v for _, v in pieces), period, sum(t.size for t, _ in pieces) / total
-    )
+    nodes, values = zip(*pieces)
+    return Steps(nodes, values, period, sum(t.size for t in nodes) / total)
 
 
 def lagged(
@@ -112,17 +111,14 @@ def predictor_of(inputs: Inputs, steps: Steps) -> Array:
 
 
 def rotation_fit(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | None:
-    """`rotation_fit_once`, with sd widened where quarters of the flight scatter by more than their sd (Birge 1932).
+    """`rotation_fit_once`, widened by the scatter of quarters of the flight.
 
     A wrong model (aerodynamic torque, a lag that varies) gives another inertia in every quarter.
     """
     fit = rotation_fit_once(inputs, steps, vehicle)
     if fit is None:
         return None
-    parts = [rotation_fit_once(inputs, part, vehicle) for part in quarters(steps)]
-    off = [(part.value - fit.value) / np.hypot(part.sd, part.bias) for part in parts if part is not None]
-    ratio = np.sqrt(np.mean(np.square(off), axis=0)) if len(off) > 1 else np.ones(fit.value.size)
-    return replace(fit, sd=fit.sd * np.maximum(ratio, 1.0))
+    return widened(fit, [rotation_fit_once(inputs, part, vehicle) for part in quarters(steps)])
 
 
 def quarters(steps: Steps) -> list[Steps]:
@@ -131,11 +127,11 @@ def quarters(steps: Steps) -> list[Steps]:
     parts = []
     for low, high in pairwise(edges):
         inside = [(t >= low) & (t <= high) for t in steps.nodes]
-        kept = [
-            (t[i], v[i]) for t, v, i in zip(steps.nodes, steps.values, inside) if i.sum() > 3 * AUTOREGRESSION_ORDER
-        ]
+        pieces = [(t[i], v[i]) for t, v, i in zip(steps.nodes, steps.values, inside)]
+        kept = [piece for piece in pieces if piece[0].size > 3 * AUTOREGRESSION_ORDER]
         if kept:
-            parts.append(Steps(tuple(t for t, _ in kept), tuple(v for _, v in kept), steps.period, steps.share))
+            nodes, values = zip(*kept)
+            parts.append(Steps(nodes, values, steps.period, steps.share))
     return parts
 
 
@@ -186,10 +182,9 @@ def rotation_fit_once(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | N
 
 def rates_of_attitude(time: Array, attitude: Array) -> tuple[Array, Array]:
     """Mean body rates (n - 1, 3) [rad/s] between attitudes (n, 4), at the middle of each step."""
-    turn = quaternion_product(quaternion_conjugate(attitude[:-1]), attitude[1:])
     span = np.diff(time)
     good = (span > 0.0) & (span < LONGEST_STEP)
-    rate = rotation_vector_from_quaternion(turn[good]) / span[good, None]
+    rate = turn(attitude[:-1][good], attitude[1:][good]) / span[good, None]
     return 0.5 * (time[:-1] + time[1:])[good], rate
 
 
@@ -252,14 +247,10 @@ def _command_noise_score(inputs: Inputs, steps: Steps, system: _RotationSystem, 
     rng = np.random.default_rng(0)
     noise = np.zeros_like(inputs.wrench)
     for axis in range(3):
-        white = _white_variance(
-            inputs.wrench[inside, 1 + axis],
-            rates[near, axis],
-            rate_variance=system.rate_variance[axis] * steps.period**2,
-        )
+        rate_variance = system.rate_variance[axis] * steps.period**2
+        white = _white_variance(inputs.wrench[inside, 1 + axis], rates[near, axis], rate_variance)
         noise[inside, 1 + axis] = math.sqrt(white) * rng.standard_normal(inside.size)
-    made = Inputs(inputs.time, noise, inputs.signal, inputs.lagged, inputs.voltage_known)
-    for mean, by_tau, by_delay in lagged(made, steps, tau=tau, delay=delay):
+    for mean, by_tau, by_delay in lagged(replace(inputs, wrench=noise), steps, tau=tau, delay=delay):
         for axis in range(3):
             inverse = math.exp(-theta[axis])
             m, by_log_tau, by_ms = (
@@ -272,7 +263,7 @@ def _command_noise_score(inputs: Inputs, steps: Steps, system: _RotationSystem, 
     return score
 
 
-def _white_variance(command: Array, rate: Array, *, rate_variance: float) -> float:
+def _white_variance(command: Array, rate: Array, rate_variance: float) -> float:
     """Variance of white noise in command samples (n,), computed as in crazyem.estimation.inflation."""
     du, dw = np.convolve(command, _THIRD_DIFFERENCE, "valid"), np.convolve(rate, _THIRD_DIFFERENCE, "valid")
     power = float(dw @ dw)

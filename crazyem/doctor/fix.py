@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from crazyem.doctor import CHECKS
 from crazyem.doctor.kinematics import continuous
+from crazyem.doctor.streams import runs as runs_of
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.finding import Finding, Fix
-from crazyem.recordings.ordering import sound_samples
+from crazyem.recordings.ordering import Array, sound_rows, sound_samples
 from crazyem.recordings.recording import Recording, SignalArray
 
-Array = NDArray[np.float64]
 Signals = dict[str, SignalArray]
 
 # Times come first, because comparisons of signals need them. Then units: a rate in deg/s looks like impossible samples
@@ -41,7 +41,7 @@ def apply_fixes(recording: Recording, findings: Iterable[Finding]) -> tuple[Reco
 
     Returns: the repaired recording (the same if nothing was applied), and the findings whose repairs are in it.
     """
-    wanted = sorted((f for f in findings if _possible(recording, f.fix)), key=_place)
+    wanted = sorted((f for f in findings if _possible(recording, f.fix)), key=_rank)
     applied: list[Finding] = []
     for finding in wanted:
         current = _again(recording, finding)
@@ -58,7 +58,7 @@ def apply_fixes(recording: Recording, findings: Iterable[Finding]) -> tuple[Reco
     return recording, tuple(applied)
 
 
-def _place(finding: Finding) -> int:
+def _rank(finding: Finding) -> int:
     """Rank of a repair in the order of application: repairs of readers first, while their row numbers still hold."""
     assert finding.fix is not None
     return FIX_ORDER.index(finding.fix.kind) if _checkable(finding) else -1
@@ -100,12 +100,12 @@ def _possible(recording: Recording, fix: Fix | None) -> bool:
     """Whether a fix is well formed and can be undone."""
     if fix is None or fix.kind not in _REPAIRS or not fix.signals:
         return False
-    arrays = [recording.signals.get(name) for name in fix.signals]
-    if any(a is None for a in arrays) or not all(math.isfinite(f) for f in fix.factor):
+    if not all(math.isfinite(f) for f in fix.factor):
         return False
-    for array in arrays:
-        assert array is not None
-        rows = fix.rows
+    for name in fix.signals:
+        array, rows = recording.signals.get(name), fix.rows
+        if array is None:
+            return False
         if rows is not None and rows.size and (rows.min() < 0 or rows.max() >= array.time.size):
             return False
         if fix.kind == "scale" and (len(fix.factor) not in (1, array.value.shape[1]) or 0.0 in fix.factor):
@@ -123,14 +123,13 @@ def _possible(recording: Recording, fix: Fix | None) -> bool:
 
 
 def _scale(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
-    factor = np.broadcast_to(np.array(fix.factor, float), (array.value.shape[1],))
-    return replace(array, value=_on_rows(array.value, array.value * factor, fix.rows))
+    return replace(array, value=_on_rows(array.value, array.value * np.array(fix.factor), fix.rows))
 
 
 def _unwrap(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
     assert fix.rows is not None
     steps = np.zeros(array.time.size)
-    np.add.at(steps, fix.rows, np.array(fix.factor, float))
+    np.add.at(steps, fix.rows, fix.factor)
     return replace(array, time=array.time + np.cumsum(steps))
 
 
@@ -148,12 +147,9 @@ def _world_to_body(array: SignalArray, fix: Fix, recording: Recording) -> Signal
         return array
     matrix = rotation_matrix(_attitude_at(*attitude, array.time))
     turned = np.einsum("kji,kj->ki", matrix, array.value)
-    lost = ~np.isfinite(turned).all(axis=1) & np.isfinite(array.value).all(axis=1)
-    if fix.rows is not None:
-        inside = np.zeros(array.time.size, bool)
-        inside[fix.rows] = True
-        lost &= inside
-    return replace(array, value=_on_rows(array.value, turned, fix.rows), marked=array.marked | lost)
+    value = _on_rows(array.value, turned, fix.rows)
+    lost = ~sound_rows(value) & sound_rows(array.value)
+    return replace(array, value=value, marked=array.marked | lost)
 
 
 _REPAIRS: dict[str, Callable[[SignalArray, Fix, Recording], SignalArray]] = {
@@ -232,8 +228,6 @@ def _noted(metadata: Mapping[str, Mapping[str, str]], finding: Finding) -> dict[
 
 def runs(rows: NDArray[np.int64]) -> list[list[int]]:
     """Sample numbers as [first, last] of each run of neighbours."""
-    rows = np.unique(rows)
-    if not rows.size:
-        return []
-    cuts = np.flatnonzero(np.diff(rows) > 1)
-    return [[int(a), int(b)] for a, b in zip(rows[np.append(0, cuts + 1)], rows[np.append(cuts, rows.size - 1)])]
+    flags = np.zeros(rows.max(initial=-1) + 1, bool)
+    flags[rows] = True
+    return [[int(first), int(end) - 1] for first, end in runs_of(flags)]

@@ -8,12 +8,11 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crazyem.doctor.streams import longest, runs
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Grade, intervals_of
-from crazyem.recordings.ordering import Intervals, inside, ordered
+from crazyem.recordings.ordering import Array, Intervals, inside, ordered
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.thrust import is_rotorcraft, kind_objection
 
@@ -38,9 +37,10 @@ def check(recording: Recording) -> list[Finding]:
     found = [*kind, *_upsets(flight, tilt)]
     lying = _lying(recording, flight, tilt)
     found += lying
-    if not lying:
-        found += _impacts(recording, flight)
-        found += _drops(recording, flight)
+    path = _path(recording)
+    if not lying and path is not None and math.isfinite(flight.ground):
+        found += _impacts(recording, flight, *path)
+        found += _drops(recording, flight, *path)
     return [*found, *_course(flight)]
 
 
@@ -52,7 +52,7 @@ def _kind(recording: Recording) -> list[Finding]:
     text = f"{why[:1].upper()}{why[1:]}."
     grade = Grade.DEGRADES if is_rotorcraft(recording) else Grade.UNUSABLE
     advice = "No mass, inertia or effect can be told by these models; the checks of the streams hold all the same."
-    return [Finding("flight", grade, text, evidence={}, advice=advice)]
+    return [Finding("flight", grade, text, advice=advice)]
 
 
 def _no_flight(flight: Airtime) -> Finding:
@@ -70,13 +70,8 @@ def _course(flight: Airtime) -> Iterator[Finding]:
     starts, ends = at_work[0][0] <= flight.begin, at_work[-1][1] >= flight.end
     count = len(flight.flown)
     where = "in the air" if flight.by_height_alone else "with rotors at work"
-    remarks = []
-    if count > 1:
-        remarks.append(f"holds {count} flights")
-    if starts:
-        remarks.append(f"begins {where}")
-    if ends:
-        remarks.append(f"ends {where}")
+    known = {f"holds {count} flights": count > 1, f"begins {where}": starts, f"ends {where}": ends}
+    remarks = [remark for remark, true in known.items() if true]
     if not remarks:
         return
     total = flight.seconds
@@ -92,7 +87,7 @@ def _course(flight: Airtime) -> Iterator[Finding]:
 # -- attitude ---------------------------------------------------------------------------------------------------------
 
 
-def _tilt(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+def _tilt(recording: Recording) -> tuple[Array, Array] | None:
     """(n,) times and angles between the body's and the world's vertical in degrees, from the attitude."""
     array = recording.signals.get("attitude")
     if array is None:
@@ -107,7 +102,7 @@ def _tilt(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64
     return time, np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))
 
 
-def _upsets(flight: Airtime, tilt: tuple[NDArray[np.float64], NDArray[np.float64]] | None) -> Iterator[Finding]:
+def _upsets(flight: Airtime, tilt: tuple[Array, Array] | None) -> Iterator[Finding]:
     if tilt is None:
         return
     time, angle = tilt
@@ -125,14 +120,10 @@ def _upsets(flight: Airtime, tilt: tuple[NDArray[np.float64], NDArray[np.float64
     yield Finding("flight", Grade.DEGRADES, text, "", longest(spans), evidence, advice)
 
 
-def _lying(
-    recording: Recording, flight: Airtime, tilt: tuple[NDArray[np.float64], NDArray[np.float64]] | None
-) -> list[Finding]:
+def _lying(recording: Recording, flight: Airtime, tilt: tuple[Array, Array] | None) -> list[Finding]:
     """Finding if the drone lies on its side or back after the rotors stopped, by the attitude or by gravity at rest."""
     end = flight.lifting[-1][1]
-    angles = []
-    if tilt is not None:
-        angles.append((tilt[0], tilt[1], "attitude"))
+    angles = [] if tilt is None else [(*tilt, "attitude")]
     array = recording.signals.get("specific_force")
     if array is not None:
         time, force = ordered(array)
@@ -174,7 +165,7 @@ def _violence(recording: Recording, end: float) -> dict[str, float]:
 # -- ground -----------------------------------------------------------------------------------------------------------
 
 
-def _path(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+def _path(recording: Recording) -> tuple[Array, Array] | None:
     for name, array in recording.signals.items():
         if name == "position" or array.quantity == "position":
             time, value = ordered(array)
@@ -183,12 +174,8 @@ def _path(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64
     return None
 
 
-def _impacts(recording: Recording, flight: Airtime) -> Iterator[Finding]:
+def _impacts(recording: Recording, flight: Airtime, time: Array, position: Array) -> Iterator[Finding]:
     """Hard impacts: speed of the approach over the last `APPROACH_SECONDS` before the ground."""
-    path = _path(recording)
-    if path is None or not math.isfinite(flight.ground):
-        return
-    time, position = path
     hits: list[tuple[float, float]] = []
     for start, end in flight.airborne:
         rows = np.flatnonzero((time > start + 0.5) & (time < end + 0.5))
@@ -216,13 +203,8 @@ def _impacts(recording: Recording, flight: Airtime) -> Iterator[Finding]:
     yield Finding("flight", Grade.HARMLESS if over else Grade.DEGRADES, text, "", longest(spans), evidence, advice)
 
 
-def _drops(recording: Recording, flight: Airtime) -> list[Finding]:
+def _drops(recording: Recording, flight: Airtime, time: Array, position: Array) -> Iterator[Finding]:
     """Rotors that stop at height: cut by hand, by the supervisor, or by an empty battery."""
-    path = _path(recording)
-    if path is None or not math.isfinite(flight.ground):
-        return []
-    time, position = path
-    found = []
     for _, end in flight.lifting:
         if flight.end - end < 0.3:
             continue
@@ -240,5 +222,4 @@ def _drops(recording: Recording, flight: Airtime) -> list[Finding]:
             evidence = {"height_m": height, "time_s": end, **_violence(recording, end)}
             advice = f"Use the flight up to {end:.1f} s."
             spans = ((end, min(end + 1.0, flight.end)),)
-            found.append(Finding("flight", Grade.DEGRADES, text, "", spans, evidence, advice))
-    return found
+            yield Finding("flight", Grade.DEGRADES, text, "", spans, evidence, advice)

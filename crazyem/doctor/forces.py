@@ -12,7 +12,6 @@ from crazyem.doctor.kinematics import (
     GRID_STEP,
     UP,
     Grid,
-    Pose,
     Track,
     Window,
     difference,
@@ -57,10 +56,12 @@ def check(recording: Recording) -> list[Finding]:
     """Findings about every specific force and every acceleration."""
     found: list[Finding] = []
     attitudes = poses(recording)
+    moving = _moving(recording)
     for name, array in measurements(recording, "specific_force").items():
-        found += _specific_force(name, array, recording, attitudes)
+        found += _specific_force(name, array, moving, attitudes)
     for name, array in measurements(recording, "acceleration").items():
-        found += _acceleration(name, array, recording, attitudes)
+        if moving is not None:
+            found += _acceleration(name, array, moving, list(attitudes.values())[:1])
     return found
 
 
@@ -102,40 +103,33 @@ def _acceleration_of(moving: SignalArray, grid: Grid) -> Track:
     return first if moving.quantity == "velocity" else difference(first)
 
 
-def _specific_force(name: str, array: SignalArray, recording: Recording, attitudes: list[Pose]) -> list[Finding]:
-    moving = _moving(recording)
-    looks = []
-    for pose in attitudes:
-        if moving is None:
-            break
-        grid = grid_of(array, pose.array, moving)
-        if grid.size == 0:
-            continue
-        acceleration = _acceleration_of(moving, grid)
-        attitude = pose.track(grid)
-        valid = acceleration.valid & attitude.valid
-        kinematic = acceleration.value
-        force = kinematic + GRAVITY * UP
-        turned = rotate(attitude.value, force, inverse=True)
-        candidates = {
-            "body": (0, Track(turned, valid)),
-            "world": (1, Track(force, valid)),
-            "body, gravity removed": (1, Track(rotate(attitude.value, kinematic, inverse=True), valid)),
-            "turned twice": (2, Track(rotate(attitude.value, turned, inverse=True), valid)),
-            "world, gravity removed": (2, Track(kinematic, valid)),
-        }
-        width, source = max(FORCE_WINDOW, width_for(array, pose.array, moving)), f"{pose.name} and motion"
-        one = compare_hypotheses(array, grid, source, candidates, width=width, least=LEAST_FORCE_RMS)
-        if one is not None:
-            looks.append(one)
-    looks.sort(key=lambda one: -one.explained)
-    if looks and looks[0].explained >= LEAST_EXPLAINED_SHARE:
-        seen = looks[0]
-        if seen.choice.denied:
-            return [_structure(name, seen)]
-        level, error = _level(seen)
-        return _judge_level(name, level, error, seen)
-    return _by_weight(name, array, attitudes)
+def _specific_force(
+    name: str, array: SignalArray, moving: SignalArray | None, attitudes: Mapping[str, SignalArray]
+) -> list[Finding]:
+    looks = [] if moving is None else [_compare(array, *pose, moving) for pose in attitudes.items()]
+    seen = max((one for one in looks if one is not None), key=lambda one: one.explained, default=None)
+    if seen is None or seen.explained < LEAST_EXPLAINED_SHARE:
+        return _by_weight(name, array, list(attitudes.values())[:1])
+    return [_structure(name, seen)] if seen.choice.denied else _judge_level(name, *_level(seen), seen)
+
+
+def _compare(array: SignalArray, pose: str, turning: SignalArray, moving: SignalArray) -> Comparison | None:
+    grid = grid_of(array, turning, moving)
+    acceleration = _acceleration_of(moving, grid)
+    attitude = track(turning, grid)
+    valid = acceleration.valid & attitude.valid
+    kinematic = acceleration.value
+    force = kinematic + GRAVITY * UP
+    turned = rotate(attitude.value, force, inverse=True)
+    candidates = {
+        "body": (0, Track(turned, valid)),
+        "world": (1, Track(force, valid)),
+        "body, gravity removed": (1, Track(rotate(attitude.value, kinematic, inverse=True), valid)),
+        "turned twice": (2, Track(rotate(attitude.value, turned, inverse=True), valid)),
+        "world, gravity removed": (2, Track(kinematic, valid)),
+    }
+    width = max(FORCE_WINDOW, width_for(array, turning, moving))
+    return compare_hypotheses(array, grid, f"{pose} and motion", candidates, width=width, least=LEAST_FORCE_RMS)
 
 
 def _level(seen: Comparison) -> tuple[float, float]:
@@ -144,13 +138,13 @@ def _level(seen: Comparison) -> tuple[float, float]:
     return float(seen.mean @ seen.predicted) / size**2, float(np.linalg.norm(seen.mean_error)) / size
 
 
-def _by_weight(name: str, array: SignalArray, attitudes: list[Pose]) -> list[Finding]:
+def _by_weight(name: str, array: SignalArray, attitudes: list[SignalArray]) -> list[Finding]:
     """Findings without motion to compare: over a flight that begins and ends at rest the mean force is the weight."""
-    for pose in attitudes[:1]:
-        grid = grid_of(array, pose.array)
-        window = Window(FORCE_WINDOW)
-        attitude, force = pose.track(grid), track(array, grid)
-        world = window.mean(Track(rotate(attitude.value, force.value), attitude.valid & force.valid))
+    for turning in attitudes:
+        grid = grid_of(array, turning)
+        attitude, force = track(turning, grid), track(array, grid)
+        turned = Track(rotate(attitude.value, force.value), attitude.valid & force.valid)
+        world = Window(FORCE_WINDOW).mean(turned)
         if world.valid.sum() * GRID_STEP >= 5.0:
             value = world.value[world.valid]
             return _judge_level(name, float(value[:, 2].mean()) / GRAVITY, 0.05, None)
@@ -220,17 +214,12 @@ def _structure(name: str, seen: Comparison) -> Finding:
     return misread("forces", name, seen, known, noun="specific force", what="", fix=fix)
 
 
-def _acceleration(name: str, array: SignalArray, recording: Recording, attitudes: list[Pose]) -> list[Finding]:
-    moving = _moving(recording)
-    if moving is None:
-        return []
-    grid = grid_of(array, moving, *(pose.array for pose in attitudes[:1]))
-    if grid.size == 0:
-        return []
+def _acceleration(name: str, array: SignalArray, moving: SignalArray, attitudes: list[SignalArray]) -> list[Finding]:
+    grid = grid_of(array, moving, *attitudes)
     kinematic = _acceleration_of(moving, grid)
     candidates: dict[str, tuple[int, Track]] = {"world": (0, kinematic)}
-    for pose in attitudes[:1]:
-        attitude = pose.track(grid)
+    for turning in attitudes:
+        attitude = track(turning, grid)
         valid = kinematic.valid & attitude.valid
         candidates["body, gravity removed"] = (1, Track(rotate(attitude.value, kinematic.value, inverse=True), valid))
         force = kinematic.value + GRAVITY * UP

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import COMMAND_SIGNALS, listed, longest, runs
+from crazyem.doctor.streams import COMMAND_SIGNALS, listed, longest, runs, same_as_before
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.ordering import inside
@@ -31,12 +31,8 @@ SHORTEST_STILLNESS: dict[str, float] = {
 FEWEST_STILL_SAMPLES = 10
 STILLNESS_RATIO = 6.0  # least length of a stuck stretch, over the 99th percentile of the channel's other still ones
 _INERTIAL_SIGNALS = frozenset({"body_rate", "specific_force", "acceleration"})
-_LEAST_MOTION = {
-    "position": 0.03,
-    "velocity": 0.15,
-    "attitude": 0.03,
-    "euler": 0.03,
-}  # m, m/s, rad; least motion during the stretch by other signals
+# m, m/s, rad; least motion during the stretch by other signals
+_LEAST_MOTION = {"position": 0.03, "velocity": 0.15, "attitude": 0.03, "euler": 0.03}
 
 
 def check(recording: Recording) -> list[Finding]:
@@ -56,7 +52,7 @@ def check(recording: Recording) -> list[Finding]:
         elif name == "voltage" and flat_voltage(recording, flight):
             found.append(_flat_voltage(recording, array))
     while stuck:
-        first = stuck.pop(0)
+        first, *stuck = stuck
         alike = [other for other in stuck if _alike(first, other)]
         stuck = [other for other in stuck if other not in alike]
         company = _company_of(recording, first, alike) if alike else []
@@ -106,11 +102,8 @@ def _alike(one: _Stuck, other: _Stuck) -> bool:
 
 def _constant(value: NDArray[np.float64]) -> bool:
     """True if all finite values of each component are equal."""
-    for column in value.T:
-        sound = column[np.isfinite(column)]
-        if sound.size == 0 or sound[0] != sound[-1] or (sound != sound[0]).any():
-            return False
-    return True
+    sound = (column[np.isfinite(column)] for column in value.T)
+    return all(column.size and (column == column[0]).all() for column in sound)
 
 
 def _idle(names: list[str]) -> Finding:
@@ -121,16 +114,13 @@ def _idle(names: list[str]) -> Finding:
 
 def _flat_voltage(recording: Recording, array: SignalArray) -> Finding:
     volts = float(np.nanmedian(array.value))
-    matters = "motor_command" in recording.signals or "motor_request" in recording.signals
-    cost = (
-        f" Thrust from duty goes with its square, so the mass may be {percent(UNKNOWN_VOLTAGE_ERROR)} off."
-        if matters
-        else " Nothing here needs it."
-    )
-    text = f"voltage is {volts:.3f} V throughout the flight, though rotors load a battery.{cost}"
-    evidence = {"voltage_V": volts}
+    grade, cost = Grade.HARMLESS, "Nothing here needs it."
+    if "motor_command" in recording.signals or "motor_request" in recording.signals:
+        off = percent(UNKNOWN_VOLTAGE_ERROR)
+        grade, cost = Grade.DEGRADES, f"Thrust from duty goes with its square, so the mass may be {off} off."
+    text = f"voltage is {volts:.3f} V throughout the flight, though rotors load a battery. {cost}"
     advice = "Look at what writes it. A supply or a simulation may hold its voltage; a battery does not."
-    return Finding("frozen", Grade.DEGRADES if matters else Grade.HARMLESS, text, "voltage", (), evidence, advice)
+    return Finding("frozen", grade, text, "voltage", (), {"voltage_V": volts}, advice)
 
 
 def _signal(recording: Recording, name: str, array: SignalArray, flight: Airtime) -> list[_Stuck]:
@@ -140,12 +130,11 @@ def _signal(recording: Recording, name: str, array: SignalArray, flight: Airtime
     flying = inside(array.time, flight.airborne)
     if flying.sum() < FEWEST_STILL_SAMPLES:
         return []
-    still = [_still(column) & flying for column in array.value.T]
+    still = [same_as_before(column[:, None]) & flying for column in array.value.T]
     together = np.logical_and.reduce(still)
     least = SHORTEST_STILLNESS[array.quantity]
     found = []
-    stuck = _stretches(array, together, least)
-    stuck = [span for span in stuck if _others_moved(recording, name, array, span)]
+    stuck = [s for s in _stretches(array, together, least) if _others_moved(recording, name, array, s)]
     if stuck:
         found.append(_Stuck(name, array, "", stuck, flying))
     if array.quantity in _INERTIAL_SIGNALS or array.quantity == "rotor_speed":
@@ -158,13 +147,6 @@ def _signal(recording: Recording, name: str, array: SignalArray, flight: Airtime
             if alone:
                 found.append(_Stuck(name, array, component, alone, flying))
     return found
-
-
-def _still(column: NDArray[np.float64]) -> Flags:
-    """(n,) True for samples equal to the one before."""
-    same = np.zeros(column.size, bool)
-    same[1:] = column[1:] == column[:-1]
-    return same
 
 
 def _stretches(array: SignalArray, flags: Flags, least: float) -> list[tuple[int, int]]:
@@ -211,37 +193,35 @@ def _others_moved(recording: Recording, name: str, array: SignalArray, span: tup
         moved = _travelled(recording, "body_rate", start, end)
     if math.isnan(moved):
         # no related signal: use another measurement of the same quantity
-        for label, other_array in recording.signals.items():
-            if label != name and other_array.quantity == quantity:
-                moved = _spread(recording, label, start, end)
-                break
+        others = [other for other, a in recording.signals.items() if other != name and a.quantity == quantity]
+        moved = _spread(recording, others[0], start, end) if others else math.nan
     return end - start > 1.0 if math.isnan(moved) else moved > _LEAST_MOTION[quantity]
 
 
-def _between(array: SignalArray, start: float, end: float) -> NDArray[np.float64]:
-    rows = (array.time >= start) & (array.time <= end)
-    value = array.value[rows]
+def _between(recording: Recording, name: str, start: float, end: float) -> NDArray[np.float64]:
+    """(n, c) finite samples of a signal within an interval; empty without the signal."""
+    array = recording.signals.get(name)
+    if array is None:
+        return np.empty((0, 1))
+    value = array.value[(array.time >= start) & (array.time <= end)]
     return value[np.isfinite(value).all(axis=1)]
 
 
 def _spread(recording: Recording, name: str, start: float, end: float) -> float:
     """Largest range of a component within an interval; NaN without samples."""
-    array = recording.signals.get(name)
-    value = _between(array, start, end) if array is not None else np.empty((0, 1))
+    value = _between(recording, name, start, end)
     return float(np.ptp(value, axis=0).max()) if value.shape[0] > 2 else math.nan
 
 
 def _travelled(recording: Recording, name: str, start: float, end: float) -> float:
     """Length of the integral of a rate over an interval; NaN without samples."""
-    array = recording.signals.get(name)
-    value = _between(array, start, end) if array is not None else np.empty((0, 1))
+    value = _between(recording, name, start, end)
     return float(np.linalg.norm(value.mean(axis=0))) * (end - start) if value.shape[0] > 2 else math.nan
 
 
 def _bent(recording: Recording, start: float, end: float) -> float:
     """Change of the mean velocity between the halves of an interval, from the position; NaN without samples."""
-    array = recording.signals.get("position")
-    value = _between(array, start, end) if array is not None else np.empty((0, 1))
+    value = _between(recording, "position", start, end)
     if value.shape[0] < 6:
         return math.nan
     half = value.shape[0] // 2
@@ -250,8 +230,7 @@ def _bent(recording: Recording, start: float, end: float) -> float:
 
 
 def _finding(first: _Stuck, names: list[str]) -> Finding:
-    array = first.array
-    rows = np.zeros(array.time.size, bool)
+    rows = np.zeros(first.array.time.size, bool)
     for start, end in first.stretches:
         rows[start + 1 : end] = True
     share = float((rows & first.flying).sum()) / float(first.flying.sum())

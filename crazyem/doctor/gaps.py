@@ -26,9 +26,7 @@ def check(recording: Recording) -> list[Finding]:
     if not groups:
         return []
     pauses = _pauses(groups)
-    found = []
-    if pauses:
-        found.append(_pause_finding(pauses))
+    found = [_pause_finding(pauses)] if pauses else []
     begin = min(float(s.time.min()) for s in groups)
     end = max(float(s.time.max()) for s in groups)
     axes: dict[tuple[str, int, float, float, float], list[Stream]] = {}
@@ -38,7 +36,7 @@ def check(recording: Recording) -> list[Finding]:
     ends: list[_End] = []
     unused: list[str] = []
     for sharing in axes.values():
-        time = np.sort(sharing[0].time) if (np.diff(sharing[0].time) < 0).any() else sharing[0].time
+        time = np.sort(sharing[0].time)
         rhythm = cadence(time)
         if rhythm.regular:
             drops = _drops(sharing, time, rhythm, pauses, _known_losses(recording, sharing))
@@ -126,10 +124,9 @@ def local_periods(time: NDArray[np.float64], period: float) -> NDArray[np.float6
         return local
     windows = np.lib.stride_tricks.sliding_window_view(steps, _RATE_WINDOW)
     middle = np.median(windows, axis=1)
-    alike = (np.abs(windows - middle[:, None]) <= _INTERVAL_TOLERANCE * middle[:, None]).mean(
-        axis=1
-    ) >= _EQUAL_INTERVAL_SHARE
-    for first in np.flatnonzero(alike & (middle > _SLOWER_RATIO * period)):
+    alike = np.abs(windows - middle[:, None]) <= _INTERVAL_TOLERANCE * middle[:, None]
+    slower = (alike.mean(axis=1) >= _EQUAL_INTERVAL_SHARE) & (middle > _SLOWER_RATIO * period)
+    for first in np.flatnonzero(slower):
         local[first : first + _RATE_WINDOW] = np.maximum(local[first : first + _RATE_WINDOW], middle[first])
     # a window may contain the change of rate: short intervals in it belong to the faster rate
     return np.where(steps < 0.5 * local, period, local)
@@ -148,8 +145,7 @@ def _drops(
             overlap |= (time[1:] > start) & (time[:-1] < end)
         lost[~overlap] = 0
     if pauses:
-        starts = np.array([a for a, _ in pauses])
-        ends = np.array([b for _, b in pauses])
+        starts, ends = np.array(pauses).T
         for row in np.flatnonzero(lost):
             covered = np.minimum(ends, time[row + 1]) - np.maximum(starts, time[row])
             if (covered >= 0.9 * (time[row + 1] - time[row])).any():
@@ -170,15 +166,9 @@ def _drops(
         f"{listed([stream.name for stream in sharing])}: {_number(count, 'record')} ({percent(share)}) missing "
         f"in {_number(rows.size, 'place')}, the longest gap {1000 * lasting:.0f} ms."
     )
-    evidence = {
-        "lost": count,
-        "share": share,
-        "gaps": int(rows.size),
-        "longest_s": lasting,
-        "period_s": rhythm.period,
-    }
+    evidence = {"lost": count, "share": share, "gaps": rows.size, "longest_s": lasting, "period_s": rhythm.period}
     advice = "Nothing to repair: use the stamps, never the row number, and look at the link or the log rate."
-    spans = longest((float(time[i]), float(time[i + 1])) for i in rows)
+    spans = longest(zip(time[rows], time[rows + 1]))
     return [Finding("gaps", grade, text, sole(names), spans, evidence, advice)]
 
 
@@ -188,12 +178,12 @@ def _number(count: int, word: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _End:
-    """An interval at the start or the end (`last`) of the recording without values of some signals."""
+    """An interval at the start or the end (`last`) of the recording without values of a signal."""
 
+    name: str
     last: bool
     start: float
     end: float
-    names: tuple[str, ...]
 
 
 def _ends(stream: Stream, rhythm: Cadence, begin: float, end: float) -> list[_End]:
@@ -207,9 +197,9 @@ def _ends(stream: Stream, rhythm: Cadence, begin: float, end: float) -> list[_En
         if there.size:
             first, last = float(array.time[there[0]]), float(array.time[there[-1]])
             if end - last > least:
-                found.append(_End(True, last, end, (name,)))
+                found.append(_End(name, True, last, end))
             if first - begin > least:
-                found.append(_End(False, begin, first, (name,)))
+                found.append(_End(name, False, begin, first))
     return found
 
 
@@ -218,13 +208,10 @@ def _end_findings(ends: list[_End], duration: float) -> list[Finding]:
     found = []
     while ends:
         one = ends[0]
-        close = [
-            e
-            for e in ends
-            if e.last == one.last and abs(e.start - one.start) + abs(e.end - one.end) < SIMULTANEOUS_SECONDS
-        ]
+        alike = [e for e in ends if e.last == one.last]
+        close = [e for e in alike if abs(e.start - one.start) + abs(e.end - one.end) < SIMULTANEOUS_SECONDS]
         ends = [e for e in ends if e not in close]
-        names = [name for e in close for name in e.names]
+        names = [e.name for e in close]
         silent = max(e.end - e.start for e in close)
         share = silent / max(duration, 1e-9)
         text = f"{listed(names)}: no values in the {'last' if one.last else 'first'} {silent:.1f} s of the recording."

@@ -5,13 +5,13 @@ those of similar drones is rejected. The regressions are in excitation.py.
 """
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor import excitation
+from crazyem.doctor.envelope import sound_signal
 from crazyem.doctor.excitation import Steps
 from crazyem.doctor.kinematics import continuous
 from crazyem.doctor.regression import Fit, linear_fit
@@ -19,12 +19,10 @@ from crazyem.physics.effects.timing import INPUT_DELAY
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.airborne import Airtime
 from crazyem.recordings.finding import percent
-from crazyem.recordings.ordering import held, sound_samples
+from crazyem.recordings.ordering import Array, held
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.thrust import UNKNOWN_VOLTAGE_ERROR, Inputs, inputs_of
 from crazyem.vehicle import GRAVITY, Vehicle
-
-Array = NDArray[np.float64]
 
 IDENTIFIABLE = 0.15  # relative standard deviation below which a parameter counts as identified
 WEAKLY_IDENTIFIABLE = 0.5  # the same below which the data add information to the prior
@@ -40,31 +38,17 @@ SCALE_REASON = "only its ratio to the rotors' thrust scale is seen"
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether one parameter can be identified.
+    """Whether one parameter can be identified."""
 
-    Attributes:
-        name: mass, Ixx, Iyy, Izz, motor_time_constant, input_delay, torque_offsets, drag or battery_law.
-        verdict: "yes", "weak" (little information) or "no".
-        reason: of the verdict, one clause.
-        relative_sd: expected standard deviation from the whole flight, over the value; None if it is unknown or the
-            value may be zero.
-        window_relative_sd: the same for the estimator's default window of 800 samples.
-        sd: expected standard deviation in `unit`; None if unknown.
-        value: in `unit`, at which the error is computed; a rough fit, not an estimate to use.
-    """
-
-    name: str
-    verdict: str
-    reason: str
+    name: str  # one of `VERDICT_NAMES`
+    verdict: str  # "yes", "weak" (little information) or "no"
+    reason: str  # of the verdict, one clause
+    # expected standard deviation from the whole flight, over the value; None if unknown, or if the value may be zero
     relative_sd: float | None = None
-    window_relative_sd: float | None = None
-    sd: float | None = None
-    value: float | None = None
+    window_relative_sd: float | None = None  # the same for the estimator's default window of 800 samples
+    sd: float | None = None  # expected standard deviation in `unit`; None if unknown
+    value: float | None = None  # in `unit`, at which the error is computed; a rough fit, not an estimate to use
     unit: str = ""
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
 
     def line(self) -> str:
         """For a terminal."""
@@ -109,7 +93,7 @@ def replay_objection(recording: Recording, vehicle: Vehicle) -> str:
     inputs = inputs_of(recording, vehicle)
     if isinstance(inputs, str):
         return inputs
-    lacking = [name for name in ("position", "attitude") if _sound(recording, name) is None]
+    lacking = [name for name in ("position", "attitude") if sound_signal(recording, name) is None]
     lacking += [] if inputs.voltage_known else ["voltage"]
     return f"it has no {' and no '.join(lacking)}" if lacking else ""
 
@@ -128,7 +112,7 @@ class _Vertical:
 
 
 def _vertical(recording: Recording, air: Airtime) -> _Vertical | None:
-    velocity, attitude = _sound(recording, "velocity"), _sound(recording, "attitude")
+    velocity, attitude = sound_signal(recording, "velocity"), sound_signal(recording, "attitude")
     if velocity is not None:
         steps = excitation.steps_of(*_with_attitude(velocity, attitude), air)
         if steps is not None:
@@ -141,7 +125,7 @@ def _vertical(recording: Recording, air: Airtime) -> _Vertical | None:
             if attitude is not None:
                 return _Vertical(steps, response, "velocity and attitude", 0.0)
             return _Vertical(steps, response, "velocity, taken as upright", _lean(steps))
-    force = _sound(recording, "specific_force")
+    force = sound_signal(recording, "specific_force")
     if force is not None:
         steps = excitation.steps_of(force[0], force[1], air)
         if steps is not None:
@@ -195,10 +179,10 @@ def _slow(time: Array, velocity: Array) -> Array:
 
 
 def _rates(recording: Recording, air: Airtime) -> tuple[Steps | None, str]:
-    rate = _sound(recording, "body_rate")
+    rate = sound_signal(recording, "body_rate")
     if rate is not None:
         return excitation.steps_of(rate[0], rate[1], air), "body rate"
-    attitude = _sound(recording, "attitude")
+    attitude = sound_signal(recording, "attitude")
     if attitude is not None and attitude[0].size > 2:
         return excitation.steps_of(*excitation.rates_of_attitude(*attitude), air), "attitude alone"
     return None, ""
@@ -307,10 +291,10 @@ def _offsets(fit: Fit, vehicle: Vehicle) -> Verdict:
 
 
 def _drag(recording: Recording, air: Airtime) -> Verdict:
-    velocity, attitude = _sound(recording, "velocity"), _sound(recording, "attitude")
+    velocity, attitude = sound_signal(recording, "velocity"), sound_signal(recording, "attitude")
     if velocity is None or attitude is None:
         return Verdict("drag", "no", "needs velocity and attitude")
-    force = _sound(recording, "specific_force")
+    force = sound_signal(recording, "specific_force")
     response, columns, source, steps = _sideways(velocity, attitude, force, air)
     if steps is None:
         return Verdict("drag", "no", "too few samples of velocity and attitude in the air")
@@ -356,7 +340,7 @@ def _sideways(
 
 
 def _battery(recording: Recording, vertical: _Vertical | None, inputs: Inputs, *, tau: float, delay: float) -> Verdict:
-    name, voltage = "battery_law", _sound(recording, "voltage")
+    name, voltage = "battery_law", sound_signal(recording, "voltage")
     if inputs.signal != "motor_command" or voltage is None:
         return Verdict(name, "no", "needs the duty sent to the rotors and the battery voltage")
     if vertical is None:
@@ -425,8 +409,3 @@ def _interpolated(signal: tuple[Array, Array], at: Array) -> Array:
 def _unit(q: Array) -> Array:
     norm = np.linalg.norm(q, axis=1, keepdims=True)
     return q / np.where(norm > 0.0, norm, 1.0)
-
-
-def _sound(recording: Recording, name: str) -> tuple[Array, Array] | None:
-    array = recording.signals.get(name)
-    return None if array is None else sound_samples(array)

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crazyem.doctor.streams import COMMAND_SIGNALS, cadence, graded, places, runs
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
+from crazyem.recordings.ordering import Array, Flags, sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
 
 STRAIGHT_DEVIATION = 1e-4  # largest deviation of a hit, over the change over two steps
@@ -20,20 +20,15 @@ NEAR_MISS_DEVIATION = 1e-3  # the same for a near miss
 LEAST_RESOLUTION_STEPS = 1000.0  # least change over two steps, in units of the resolution, for a judgement
 DEGRADING_INTERPOLATED_SHARE = 0.05  # share of samples that degrades results
 RESAMPLED_SHARE = 0.5  # share of the moving samples from which the whole signal counts as resampled from a slower one
-_SLOW_SIGNALS = frozenset({"voltage"})  # change so slowly that interpolation does no harm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Straightness:
-    """(n,) flags of the samples of one signal.
+    """(n,) flags of the samples of one signal."""
 
-    `on`: the signal moves and the sample lies on the line between its neighbours. `near`: it almost does. `bend`: the
-    sample is off this line.
-    """
-
-    on: NDArray[np.bool_]
-    near: NDArray[np.bool_]
-    bend: NDArray[np.bool_]
+    on: Flags  # the signal moves, and the sample lies on the line between its neighbours
+    near: Flags  # it almost does
+    bend: Flags  # the sample is off this line
 
 
 def check(recording: Recording) -> list[Finding]:
@@ -45,7 +40,7 @@ def check(recording: Recording) -> list[Finding]:
     return found
 
 
-def straightness(time: NDArray[np.float64], value: NDArray[np.float64]) -> Straightness:
+def straightness(time: Array, value: Array) -> Straightness:
     """Which samples lie on the line between their neighbours.
 
     Args:
@@ -70,16 +65,13 @@ def straightness(time: NDArray[np.float64], value: NDArray[np.float64]) -> Strai
             moving[1:-1] += change > LEAST_RESOLUTION_STEPS * resolution
     # two components on their lines are evidence; a single one only if a neighbour in time is on a line, too
     on = (moving > 0) & ~bend
-    alone = on & (moving == 1)
-    lonely = alone.copy()
-    lonely[1:] &= ~on[:-1]
-    lonely[:-1] &= ~on[1:]
+    on &= (moving > 1) | (np.convolve(on, [1, 0, 1], "same") > 0)
     near = (moving > 0) & ~off_near & bend
     bend[[0, -1]] = False
-    return Straightness(on & ~lonely, near, bend)
+    return Straightness(on, near, bend)
 
 
-def _resolution(column: NDArray[np.float64]) -> float:
+def _resolution(column: Array) -> float:
     """Upper bound of the resolution of a column: the smallest difference between some thousand of its values."""
     some = column[:: max(1, column.size // 4000)]
     values = np.unique(some[np.isfinite(some)])
@@ -87,13 +79,10 @@ def _resolution(column: NDArray[np.float64]) -> float:
 
 
 def _signal(name: str, array: SignalArray) -> Iterator[Finding]:
-    time, value = array.time, array.value
+    time, value, rows = array.time, array.value, np.arange(array.time.size)
     if (time[1:] <= time[:-1]).any():
-        keep = np.concatenate([[True], time[1:] > np.maximum.accumulate(time)[:-1]])
-        rows = np.flatnonzero(keep)
+        rows = np.flatnonzero(np.append(True, time[1:] > np.maximum.accumulate(time)[:-1]))
         time, value = time[rows], value[rows]
-    else:
-        rows = np.arange(time.size)
     if time.size < 8:
         return
     line = straightness(time, value)
@@ -103,31 +92,25 @@ def _signal(name: str, array: SignalArray) -> Iterator[Finding]:
         return
     if array.marked.any() and hits < DEGRADING_INTERPOLATED_SHARE * time.size:
         return  # the reader has already marked this signal by its own rule
-    present = int(np.isfinite(value).all(axis=1).sum())
-    share = hits / present
-    wide = line.on.copy()
-    wide[1:] |= line.on[:-1]
-    wide[:-1] |= line.on[1:]
+    present = sound_rows(value)
+    share = hits / int(present.sum())
+    wide = np.convolve(line.on, [1, 1, 1], "same") > 0
     spans = runs(wide)
     lasting = float((time[spans[:, 1] - 1] - time[spans[:, 0]]).max())
-    moving = hits + int((line.bend & np.isfinite(value).all(axis=1)).sum())
+    moving = hits + int((line.bend & present).sum())
     evidence = {"samples": hits, "share": share, "runs": len(spans), "longest_s": lasting}
-    fix = Fix("mark", (name,), rows=rows[np.flatnonzero(line.on)])
+    fix = Fix("mark", (name,), rows=rows[line.on])
     if hits > RESAMPLED_SHARE * moving:
         duration = float(time[-1] - time[0])
         knots = runs(line.bend)
         beat = cadence(time[knots[:, 0]]).period if len(knots) else 0.0
         rate = 1.0 / beat if beat > 0 else len(knots) / max(duration, 1e-9)
         stored = (time.size - 1) / max(duration, 1e-9)
-        yield Finding(
-            "interpolated",
-            Grade.HARMLESS if array.quantity in _SLOW_SIGNALS else Grade.DEGRADES,
-            f"{name} was measured at about {rate:.3g} Hz and drawn with straight lines to {stored:.0f} Hz.",
-            signal=name,
-            evidence={**evidence, "rate_hz": rate, "stored_hz": stored},
-            advice="Mark the samples in between as missing (--fix); they hold nothing new.",
-            fix=fix,
-        )
+        text = f"{name} was measured at about {rate:.3g} Hz and drawn with straight lines to {stored:.0f} Hz."
+        evidence |= {"rate_hz": rate, "stored_hz": stored}
+        advice = "Mark the samples in between as missing (--fix); they hold nothing new."
+        grade = Grade.HARMLESS if array.quantity == "voltage" else Grade.DEGRADES  # a voltage changes slowly
+        yield Finding("interpolated", grade, text, name, (), evidence, advice, fix)
         return
     grade = graded(share, degrades=DEGRADING_INTERPOLATED_SHARE, unusable=0.6)
     text = (

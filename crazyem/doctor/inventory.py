@@ -1,6 +1,7 @@
 """Contents of a recording: signals, clocks, origin, extremes of the motion, and what can be identified from it."""
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -24,18 +25,7 @@ _LONGEST_TEXT = 120  # characters of a metadata value that are shown
 
 @dataclass(frozen=True, slots=True)
 class SignalRow:
-    """One signal.
-
-    Attributes:
-        name, quantity, unit, frame, clock, stream, source: as in `SignalArray`.
-        samples: number of samples.
-        start_s, end_s: first and last stamp, on the recording's time axis.
-        rate_hz: mean rate, gaps included: (samples - 1) over the time from the first to the last.
-        period_s: median time between samples; its inverse is the rate without losses.
-        missing_share: share of samples with a component that is not a number in the file.
-        marked_share: share of samples that the reader marked as not measured.
-        longest_gap_s: longest time between two samples.
-    """
+    """One signal; what it does not explain is as in `SignalArray`."""
 
     name: str
     quantity: str
@@ -45,42 +35,30 @@ class SignalRow:
     stream: str
     source: tuple[str, ...]
     samples: int
-    start_s: float | None
+    start_s: float | None  # first stamp, on the recording's time axis
     end_s: float | None
-    rate_hz: float | None
-    period_s: float | None
-    missing_share: float
-    marked_share: float
-    longest_gap_s: float | None
+    rate_hz: float | None  # mean rate, gaps included: (samples - 1) over the time from the first to the last
+    period_s: float | None  # median time between samples; its inverse is the rate without losses
+    missing_share: float  # share of samples with a component that is not a number in the file
+    marked_share: float  # share of samples that the reader marked as not measured
+    longest_gap_s: float | None  # longest time between two samples
 
 
 @dataclass(frozen=True, slots=True)
 class ClockRow:
-    """One clock: its name, number of signals, first and last stamp [s], and its drift against the host if known.
-
-    Attributes:
-        against_host_ppm: rate of the clock over that of the host's clock, less 1, in millionths, from a straight line
-            through the arrival times; None without arrival times.
-    """
+    """One clock."""
 
     name: str
-    signals: int
-    start_s: float
+    signals: int  # number of its signals
+    start_s: float  # first stamp
     end_s: float
+    # rate over that of the host's clock, less 1, from a line through the arrival times; None without these
     against_host_ppm: float | None
 
 
 @dataclass(frozen=True, slots=True)
 class Inventory:
-    """Contents of a recording. `to_dict` is for JSON, `text` is for a terminal.
-
-    Attributes (the others explain themselves):
-        kind: of vehicle, from its autopilot; "" if unknown.
-        other_kind: why the models do not describe this kind of vehicle; "" if they do.
-        unlike: why the rotors do not fit the vehicle; "" if they do.
-        on_the_ground: why there was no flight; "" if there was one.
-        no_replay: why `crazyem replay` cannot use the recording; "" if it can.
-    """
+    """Contents of a recording. `to_dict` is for JSON, `text` is for a terminal."""
 
     path: str
     source: str
@@ -93,11 +71,11 @@ class Inventory:
     events: Mapping[str, int]
     envelope: Envelope
     verdicts: tuple[Verdict, ...]
-    kind: str = ""
-    other_kind: str = ""
-    unlike: str = ""
-    on_the_ground: str = ""
-    no_replay: str = ""
+    kind: str = ""  # of vehicle, from its autopilot; "" if unknown
+    other_kind: str = ""  # why the models do not describe this kind of vehicle; "" if they do
+    unlike: str = ""  # why the rotors do not fit the vehicle; "" if they do
+    on_the_ground: str = ""  # why there was no flight; "" if there was one
+    no_replay: str = ""  # why `crazyem replay` cannot use the recording; "" if it can
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: units in the names of the keys, None where unknown."""
@@ -111,8 +89,8 @@ class Inventory:
             "clocks": [asdict(row) for row in self.clocks],
             "metadata": {section: dict(values) for section, values in self.metadata.items()},
             "events": dict(self.events),
-            "envelope": _listed(self.envelope.to_dict()),
-            "identifiable": [verdict.to_dict() for verdict in self.verdicts],
+            "envelope": _listed(asdict(self.envelope)),
+            "identifiable": [asdict(verdict) for verdict in self.verdicts],
             "kind": self.kind,
             "objections": {
                 "kind": self.other_kind,
@@ -138,9 +116,9 @@ class Inventory:
 
     def _vehicle_lines(self) -> list[str]:
         """Kind of vehicle, and reasons why the vehicle's models may not fit."""
-        said = self.other_kind or (f"{self.kind}, by its autopilot" if self.kind else "")
-        lines = [f"vehicle: {said}"] if said else []
-        return [*lines, *([f"weight: {self.unlike}"] if self.unlike else [])]
+        kind = self.other_kind or (f"{self.kind}, by its autopilot" if self.kind else "")
+        lines = {f"vehicle: {kind}": kind, f"weight: {self.unlike}": self.unlike}
+        return [line for line, known in lines.items() if known]
 
 
 def inventory(recording: Recording, vehicle: Vehicle | None = None) -> Inventory:
@@ -152,9 +130,6 @@ def inventory(recording: Recording, vehicle: Vehicle | None = None) -> Inventory
     """
     vehicle = vehicle or vehicle_for(recording)
     air = airtime(recording)
-    kinds: dict[str, int] = {}
-    for event in recording.events:
-        kinds[event.kind] = kinds.get(event.kind, 0) + 1
     return Inventory(
         path=recording.path,
         source=recording.source,
@@ -164,7 +139,7 @@ def inventory(recording: Recording, vehicle: Vehicle | None = None) -> Inventory
         signals=tuple(_row(name, array) for name, array in recording.signals.items()),
         clocks=_clocks(recording),
         metadata=_short(recording.metadata),
-        events=kinds,
+        events=Counter(event.kind for event in recording.events),
         envelope=envelope(recording, air),
         verdicts=identifiability(recording, vehicle, air),
         kind=recording.metadata.get("vehicle", {}).get("kind", ""),
@@ -205,16 +180,12 @@ def _clocks(recording: Recording) -> tuple[ClockRow, ...]:
     for array in recording.signals.values():
         if np.isfinite(array.time).any():
             by_name.setdefault(array.clock, []).append(array)
-    return tuple(
-        ClockRow(
-            name,
-            len(arrays),
-            min(float(np.nanmin(a.time)) for a in arrays),
-            max(float(np.nanmax(a.time)) for a in arrays),
-            _against_host(max(arrays, key=lambda a: int(np.isfinite(a.host_time).sum()))),
-        )
-        for name, arrays in by_name.items()
-    )
+    rows = []
+    for name, arrays in by_name.items():
+        start, end = min(float(np.nanmin(a.time)) for a in arrays), max(float(np.nanmax(a.time)) for a in arrays)
+        best = max(arrays, key=lambda a: int(np.isfinite(a.host_time).sum()))
+        rows.append(ClockRow(name, len(arrays), start, end, _against_host(best)))
+    return tuple(rows)
 
 
 def _against_host(array: SignalArray) -> float | None:
@@ -252,15 +223,13 @@ def _listed(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _metadata_lines(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
-    return [
-        f"  {section}: "
-        + (
-            ", ".join(f"{key} {value}" for key, value in values.items())
-            if len(values) <= _MOST_ENTRIES
-            else f"{len(values)} entries (--json shows them)"
-        )
-        for section, values in metadata.items()
-    ]
+    lines = []
+    for section, values in metadata.items():
+        text = f"{len(values)} entries (--json shows them)"
+        if len(values) <= _MOST_ENTRIES:
+            text = ", ".join(f"{key} {value}" for key, value in values.items())
+        lines.append(f"  {section}: {text}")
+    return lines
 
 
 def _signal_lines(rows: tuple[SignalRow, ...]) -> list[str]:

@@ -1,8 +1,8 @@
 """Signals for the checks that use physics: tracks on one time grid, smoothed and differentiated in the same way.
 
-A relation between two signals, y = dx/dt, is never tested by differentiating x directly: both sides are convolved with
-the same smooth window k, k * y = k' * x. The window is a raised cosine of `width` seconds. It suppresses vibration,
-quantisation, jitter of stamps and white noise.
+A relation between two signals, y = dx/dt, is tested after both sides, y and the difference of x, are convolved with the
+same smooth window. The window is a raised cosine of `width` seconds. It suppresses vibration, quantisation, jitter of
+stamps and white noise.
 """
 
 import weakref
@@ -39,24 +39,20 @@ UP = np.array([0.0, 0.0, 1.0])
 GRAVITY = 9.81  # m/s^2; the true value differs from place to place by 0.3 %
 
 
-def quantity_of(name: str, array: SignalArray) -> str:
-    """The quantity that a signal measures: by its reader, else by its name, else ""."""
-    if array.quantity:
-        return array.quantity
-    stem = name.split("@", maxsplit=1)[0]
-    return stem if stem in SIGNALS else ""
-
-
 def origin_of(name: str) -> str:
     """Origin of a measurement: "" for the recording's first choice, "mocap" for "position@mocap"."""
     return name.partition("@")[2]
 
 
 def measurements(recording: Recording, quantity: str) -> dict[str, SignalArray]:
-    """All signals that measure a quantity for at least 2 s at 4 Hz or more, through `light`; the first choice first."""
+    """All signals that measure a quantity for at least 2 s at 4 Hz or more, through `light`; the first choice first.
+
+    The reader says what a signal measures, else its name.
+    """
     found = {}
     for name, array in recording.signals.items():
-        if quantity_of(name, array) == quantity and array.value.shape[1] == SIGNALS[quantity][0]:
+        measured = array.quantity or name.partition("@")[0]
+        if measured == quantity and array.value.shape[1] == SIGNALS[quantity][0]:
             made = light(array, quantity)
             slow = quantity != "voltage" and _period(made.time) > LONGEST_SAMPLE_INTERVAL
             if made.time.size >= 20 and made.time[-1] - made.time[0] >= SHORTEST_GRID_SECONDS and not slow:
@@ -179,7 +175,7 @@ def track(array: SignalArray, grid: Grid, *, shift: float = 0.0, bridge: float =
 
 @dataclass(frozen=True)
 class Window:
-    """The raised cosine of `width` seconds and its derivative, as convolution kernels on the grid."""
+    """The raised cosine of `width` seconds, as a convolution kernel on the grid."""
 
     width: float
 
@@ -192,33 +188,16 @@ class Window:
         k = 1.0 + np.cos(np.pi * np.arange(-self.half, self.half + 1) / self.half)
         return np.asarray(k / k.sum(), float)
 
-    @cached_property
-    def slope(self) -> Array:
-        """Kernel of the derivative, scaled to give exactly 1 for a ramp of 1/s."""
-        i = np.arange(-self.half, self.half + 1)
-        k = np.sin(np.pi * i / self.half)
-        return np.asarray(k / (k @ i * GRID_STEP), float)
-
     def mean(self, given: Track) -> Track:
-        """k * x."""
-        return self._apply(given, self.kernel)
-
-    def rate(self, given: Track) -> Track:
-        """k' * x: the derivative of k * x."""
-        return self._apply(given, self.slope)
-
-    def _apply(self, given: Track, kernel: Array) -> Track:
-        if given.valid.size < kernel.size:
-            return Track(given.value, np.zeros(given.valid.size, bool))
+        """The weighted mean about each time; valid where all values in the window are."""
+        valid = np.zeros(given.valid.size, bool)
+        if valid.size < self.kernel.size:
+            return Track(given.value, valid)
         clean = np.where(given.valid[:, None], given.value, 0.0)
-        # correlation: the kernel is reversed by convolve1d
-        value = convolve1d(clean, kernel[::-1], axis=0, mode="nearest")
+        value = convolve1d(clean, self.kernel, axis=0, mode="nearest")
         missing = np.concatenate([[0], np.cumsum(~given.valid)])
-        low = np.arange(given.valid.size) - self.half
-        high = low + 2 * self.half + 1
-        inside = (low >= 0) & (high <= given.valid.size)
-        count = missing[np.clip(high, 0, given.valid.size)] - missing[np.clip(low, 0, given.valid.size)]
-        return Track(value, inside & (count == 0))
+        valid[self.half : -self.half] = missing[self.kernel.size :] == missing[: -self.kernel.size]
+        return Track(value, valid)
 
 
 def rate_of_attitude(attitude: Track) -> Track:
@@ -226,8 +205,8 @@ def rate_of_attitude(attitude: Track) -> Track:
     q = attitude.value
     rate = np.zeros((len(q), 3))
     if len(q) >= 5:
-        near = _turn(q[1:-3], q[3:-1]) / (2.0 * GRID_STEP)
-        far = _turn(q[:-4], q[4:]) / (4.0 * GRID_STEP)
+        near = turn(q[1:-3], q[3:-1]) / (2.0 * GRID_STEP)
+        far = turn(q[:-4], q[4:]) / (4.0 * GRID_STEP)
         rate[2:-2] = (4.0 * near - far) / 3.0
     return Track(rate, _inner(attitude.valid))
 
@@ -249,8 +228,8 @@ def _inner(valid: Mask) -> Mask:
     return out
 
 
-def _turn(first: Array, second: Array) -> Array:
-    """Rotation vectors of conj(first) * second, (m, 3)."""
+def turn(first: Array, second: Array) -> Array:
+    """Rotation vectors (m, 3) [rad] of conj(first) * second, (m, 4) each."""
     return rotation_vector_from_quaternion(quaternion_product(quaternion_conjugate(first), second))
 
 
@@ -290,26 +269,10 @@ def _period(time: Array) -> float:
     return float(np.median(steps)) if steps.size else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """An attitude under its signal's name. `array` holds quaternions x y z w, body to world."""
-
-    name: str
-    array: SignalArray
-
-    def track(self, grid: Grid, *, shift: float = 0.0) -> Track:
-        """(m, 4) unit quaternions on a grid; `shift` as in `kinematics.track`."""
-        return track(self.array, grid, shift=shift)
-
-
-def poses(recording: Recording) -> list[Pose]:
-    """Every attitude quaternion; if there is none, quaternions from Euler angles (in radians)."""
-    found = [Pose(name, array) for name, array in measurements(recording, "attitude").items()]
-    if found:
-        return found
-    angles = measurements(recording, "euler")
-    return [
-        Pose(name, replace(array, value=quaternion_from_euler(*array.value.T), quantity="attitude"))
-        for name, array in angles.items()
+def poses(recording: Recording) -> dict[str, SignalArray]:
+    """Quaternions x y z w, body to world, of every attitude; if there is none, of every Euler angles (in radians)."""
+    return measurements(recording, "attitude") or {
+        name: replace(array, value=quaternion_from_euler(*array.value.T), quantity="attitude")
+        for name, array in measurements(recording, "euler").items()
         if np.nanmax(np.abs(array.value)) <= 7.0
-    ]
+    }

@@ -16,7 +16,6 @@ from crazyem.doctor.delays import LARGEST_LAG, delay, spread
 from crazyem.doctor.kinematics import (
     GRID_STEP,
     Grid,
-    Pose,
     Track,
     Window,
     difference,
@@ -24,7 +23,6 @@ from crazyem.doctor.kinematics import (
     measurements,
     origin_of,
     poses,
-    quantity_of,
     rate_of_attitude,
     track,
     width_for,
@@ -50,15 +48,20 @@ UNSTEADY_SCATTER_RATIO = 2.5  # scatter of the windows over their standard error
 
 def check(recording: Recording) -> list[Finding]:
     """One finding for each stream (or origin within one) that is late or early against the stream of the first pose."""
-    reference, base = _reference(recording)
-    if base is None:
+    pose = next(iter(poses(recording).items()), None)
+    movers = [*measurements(recording, "position").items(), *measurements(recording, "velocity").items()]
+    moving = next((mover for mover in movers if pose is None or _path(*mover) == _path(*pose)), None)
+    reference = pose or moving
+    if reference is None:
         return []
+    base = _path(*reference)
     best: dict[_Path, _Lag] = {}
     for name, array in _comparable(recording):
         path = _path(name, array)
-        if path == base:
+        against = pose if array.quantity in ("body_rate", "attitude") else moving
+        if path == base or against is None:
             continue
-        lag = _lag(name, array, reference)
+        lag = _lag(name, array, *against)
         if lag is not None and (path not in best or lag.error < best[path].error):
             best[path] = lag
     found = [_judge(recording, base, path, lag) for path, lag in best.items()]
@@ -67,24 +70,16 @@ def check(recording: Recording) -> list[Finding]:
 
 @dataclass(frozen=True)
 class _Changes:
-    """How the lag changes inside a flight [s].
+    """How the lag changes inside a flight [s]."""
 
-    Attributes:
-        start, end: values of a line through the windows, at the ends of the flight.
-        drift, drift_error: end less start, and its standard error.
-        scatter: robust standard deviation of the windows about their median, over their standard errors.
-        about_line: the same about the line.
-        low, high: 10th and 90th percentile of the windows.
-    """
-
-    start: float
+    start: float  # of a line through the windows
     end: float
-    drift: float
+    drift: float  # end less start
     drift_error: float
-    scatter: float
-    about_line: float
-    low: float
-    high: float
+    scatter: float  # robust standard deviation of the windows about their median, over their standard errors
+    about_line: float  # the same about the line
+    low: float  # 10th percentile of the windows
+    high: float  # 90th percentile
     windows: int
 
 
@@ -102,14 +97,6 @@ class _Lag:
     changes: _Changes | None
 
 
-@dataclass(frozen=True)
-class _Reference:
-    """Reference of the comparisons: the first attitude, and the first position or velocity of its stream."""
-
-    pose: Pose | None
-    moving: tuple[str, SignalArray] | None
-
-
 # stream and origin of samples; a table may hold signals of several origins
 _Path = tuple[str, str]
 
@@ -121,18 +108,6 @@ def _path(name: str, array: SignalArray) -> _Path:
 def _said(path: _Path, base: _Path) -> str:
     """Text for a path: the stream, or the origin if both paths share a stream."""
     return path[1] or path[0] if path[0] == base[0] and path != base else path[0]
-
-
-def _reference(recording: Recording) -> tuple[_Reference, _Path | None]:
-    """The reference and its path (None if there is none)."""
-    pose = next(iter(poses(recording)), None)
-    movers = {**measurements(recording, "position"), **measurements(recording, "velocity")}
-    path = _path(pose.name, pose.array) if pose else None
-    same = [(n, a) for n, a in movers.items() if path in (None, _path(n, a))]
-    moving = next(iter(same), None)
-    if path is None and moving is not None:
-        path = _path(*moving)
-    return _Reference(pose, moving), path
 
 
 def _comparable(recording: Recording) -> list[tuple[str, SignalArray]]:
@@ -148,31 +123,19 @@ def _comparable(recording: Recording) -> list[tuple[str, SignalArray]]:
     ]
 
 
-def _lag(name: str, array: SignalArray, reference: _Reference) -> _Lag | None:
-    turning = quantity_of(name, array) in ("body_rate", "attitude")
-    if turning:
-        if reference.pose is None:
-            return None
-        against, other = reference.pose.name, reference.pose.array
-    else:
-        if reference.moving is None:
-            return None
-        against, other = reference.moving
+def _lag(name: str, array: SignalArray, against: str, other: SignalArray) -> _Lag | None:
     grid = grid_of(array, other)
     if grid.size * GRID_STEP < WINDOW_SECONDS * FEWEST_WINDOWS / 2:
         return None
-    window = Window(max(0.3 if turning else 0.2, width_for(array, other)))
-    first = window.mean(_speed(other, against, grid))
-    second = window.mean(_speed(array, name, grid))
-    return _fit(name, against, first, second, grid, window.width)
+    window = Window(max(0.3 if other.quantity == "attitude" else 0.2, width_for(array, other)))
+    return _fit(name, against, window.mean(_speed(other, grid)), window.mean(_speed(array, grid)), grid, window.width)
 
 
-def _speed(array: SignalArray, name: str, grid: Grid) -> Track:
-    quantity = quantity_of(name, array)
+def _speed(array: SignalArray, grid: Grid) -> Track:
     given = track(array, grid, bridge=LAG_BRIDGED_SECONDS)
-    if quantity == "attitude":
+    if array.quantity == "attitude":
         return rate_of_attitude(given)
-    return difference(given) if quantity == "position" else given
+    return difference(given) if array.quantity == "position" else given
 
 
 def _fit(name: str, against: str, first: Track, second: Track, grid: Grid, width: float) -> _Lag | None:

@@ -9,37 +9,31 @@ from numpy.typing import NDArray
 
 from crazyem.doctor.streams import listed, longest, places, same_as_before
 from crazyem.recordings.finding import Finding, Fix, Grade
-from crazyem.recordings.ordering import sound_rows
+from crazyem.recordings.ordering import Array, Flags, sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
 
-Rows = NDArray[np.bool_]
+Rows = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """Bounds of a quantity.
+    """Bounds of a quantity."""
 
-    Attributes:
-        measure: function of (n, c) values; gives (n,) numbers to compare with the bounds.
-        low, high: bounds; values outside are impossible.
-        words: description of an impossible value.
-    """
-
-    measure: Callable[[NDArray[np.float64]], NDArray[np.float64]]
-    low: float
+    measure: Callable[[Array], Array]  # (n, c) values -> (n,) numbers to compare with the bounds
+    low: float  # values outside are impossible
     high: float
-    words: str
+    words: str  # description of an impossible value
 
 
-def _norm(value: NDArray[np.float64]) -> NDArray[np.float64]:
+def _norm(value: Array) -> Array:
     return np.sqrt(np.einsum("ij,ij->i", value, value))
 
 
-def _largest(value: NDArray[np.float64]) -> NDArray[np.float64]:
+def _largest(value: Array) -> Array:
     return np.abs(value).max(axis=1)
 
 
-def _extreme(value: NDArray[np.float64]) -> NDArray[np.float64]:
+def _extreme(value: Array) -> Array:
     """(n,) the component furthest from 0.5."""
     low, high = value.min(axis=1), value.max(axis=1)
     return np.where(high - 0.5 > 0.5 - low, high, low)
@@ -62,10 +56,8 @@ VALUE_LIMITS: dict[str, Limit] = {
 }
 
 
-ZERO_WITHOUT_SENSOR = {
-    "voltage": "battery monitor",
-    "rotor_speed": "rotor speed sensor",
-}  # quantities that read 0 without their sensor
+# quantities that read 0 without their sensor
+ZERO_WITHOUT_SENSOR = {"voltage": "battery monitor", "rotor_speed": "rotor speed sensor"}
 # Other units of motor commands: (words, unit in a mapping, lowest and highest typical value).
 _MOTOR_UNITS = (
     ("pulse lengths in us", "us", 900.0, 2100.0),
@@ -74,7 +66,7 @@ _MOTOR_UNITS = (
 )
 
 
-def _unit_of_motors(array: SignalArray, values: NDArray[np.float64]) -> str:
+def _unit_of_motors(array: SignalArray, values: Array) -> str:
     """Advice about the likely unit of motor commands; "" for other quantities and unknown units."""
     if array.quantity not in ("motor_command", "motor_request"):
         return ""
@@ -95,7 +87,7 @@ def _unconnected(name: str, array: SignalArray) -> Finding:
 def check(recording: Recording) -> list[Finding]:
     """Findings about NaN and infinities of the file itself, impossible values and jumps, stamps that are no numbers."""
     found: list[Finding] = []
-    unmapped: list[tuple[str, int]] = []
+    unmapped: dict[str, int] = {}
     for name, array in recording.signals.items():
         if array.time.size == 0:
             continue
@@ -106,16 +98,15 @@ def check(recording: Recording) -> list[Finding]:
             if array.quantity or "@" in name:
                 found.append(_not_numbers(name, array, bad))
             else:
-                unmapped.append((name, int(bad.sum())))
+                unmapped[name] = int(bad.sum())
         limit = VALUE_LIMITS.get(array.quantity)
         if limit is not None:
             found += _impossible(name, array, limit, sound)
         if array.quantity == "position" and "velocity" not in recording.signals:
-            found += position_jumps(name, array, furthest=VALUE_LIMITS["position"].high)
+            found += _position(name, array)
     if unmapped:
-        names = [name for name, _ in unmapped]
-        text = f"{listed(names)} hold values that are no numbers; nothing here uses these columns."
-        evidence = {"columns": len(names), "samples": sum(count for _, count in unmapped)}
+        text = f"{listed([*unmapped])} hold values that are no numbers; nothing here uses these columns."
+        evidence = {"columns": len(unmapped), "samples": sum(unmapped.values())}
         found.append(Finding("numbers", Grade.HARMLESS, text, "", (), evidence))
     return found
 
@@ -130,7 +121,7 @@ def _stamps(name: str, array: SignalArray) -> Iterator[Finding]:
     yield Finding("numbers", Grade.UNUSABLE, text, name, (), evidence, advice)
 
 
-def _not_numbers(name: str, array: SignalArray, bad: Rows) -> Finding:
+def _not_numbers(name: str, array: SignalArray, bad: Flags) -> Finding:
     share = float(bad.mean())
     text = f"{name} is not a number in {int(bad.sum())} of {bad.size} samples, and the file does not say why."
     evidence = {"samples": int(bad.sum()), "share": share}
@@ -141,7 +132,7 @@ def _not_numbers(name: str, array: SignalArray, bad: Rows) -> Finding:
     return Finding("numbers", grade, text, name, spans, evidence, advice, fix)
 
 
-def _impossible(name: str, array: SignalArray, limit: Limit, sound: Rows) -> Iterator[Finding]:
+def _impossible(name: str, array: SignalArray, limit: Limit, sound: Flags) -> Iterator[Finding]:
     if limit.measure is not _norm:
         low, high = float(array.value.min()), float(array.value.max())  # NaN fails both comparisons
         if low >= (limit.low if limit.low != 0.0 else -limit.high) and high <= limit.high:
@@ -175,9 +166,6 @@ def _impossible(name: str, array: SignalArray, limit: Limit, sound: Rows) -> Ite
     yield Finding("numbers", grade, text, name, spans, evidence, advice, fix)
 
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-
 LEAST_JUMP = 0.1  # m, least deviation of a step from the motion around it: ten times a step at 100 Hz and 1 m/s
 CRASH_ACCELERATION = 100.0  # m/s^2 of a crash: limits the deviation of a step that is still possible
 JUMP_NOISE_RATIO = 12.0  # least deviation of a step, over the median deviation
@@ -187,10 +175,11 @@ COARSE_RESOLUTION = 0.005  # m; a coarser one gives a velocity over 0.1 s to no 
 _FEWEST_SAMPLES = 50
 
 
-def position_jumps(name: str, array: SignalArray, *, furthest: float) -> list[Finding]:
-    """Findings about one position, from samples within `furthest` [m]; held values do not count as new samples."""
+def _position(name: str, array: SignalArray) -> list[Finding]:
+    """Findings about one position, from its possible samples; held values do not count as new samples."""
     with np.errstate(invalid="ignore"):
-        good = np.isfinite(array.time) & (np.abs(array.value) <= furthest).all(axis=1) & ~same_as_before(array.value)
+        near = (np.abs(array.value) <= VALUE_LIMITS["position"].high).all(axis=1)
+        good = np.isfinite(array.time) & near & ~same_as_before(array.value)
     sound = np.flatnonzero(good)
     time, value = array.time[sound], array.value[sound]
     if sound.size < _FEWEST_SAMPLES or (np.diff(time) <= 0.0).any():
@@ -213,7 +202,7 @@ def _neighbour_velocity(velocity: Array) -> Array:
 
 
 def _found(
-    name: str, array: SignalArray, sound: Indices, time: Array, value: Array, rows: Indices, off: Array
+    name: str, array: SignalArray, sound: Rows, time: Array, value: Array, rows: Rows, off: Array
 ) -> Iterator[Finding]:
     """One finding for all jumps; samples between a jump and the jump back can be marked."""
     if not rows.size:
@@ -242,28 +231,24 @@ def _found(
     marked = int(flags.sum())
     times = "once" if len(spans) == 1 else f"{len(spans)} times"
     back_again = "" if not marked else " and back" if not away else f", {len(spans) - away} of them back"
-    yield Finding(
-        "numbers",
-        Grade.DEGRADES,
+    text = (
         f"{name} leaps {times}{back_again}, by up to {off[worst]:.2f} m in {1e3 * lasting:.0f} ms "
-        f"({speed:.0f} m/s): no drone moves like that.",
-        signal=name,
-        intervals=longest(spans),
-        evidence={"leaps": len(spans), "size_m": float(off[worst]), "speed_m_s": speed, "samples": marked},
-        advice="Mark the samples away from the path as missing (--fix)."
-        if marked
-        else "Another frame from there on, or a jump of the filter on board: use the parts before and after.",
-        fix=Fix("mark", (name,), rows=np.flatnonzero(flags)) if marked else None,
+        f"({speed:.0f} m/s): no drone moves like that."
     )
+    evidence = {"leaps": len(spans), "size_m": float(off[worst]), "speed_m_s": speed, "samples": marked}
+    advice, fix = "Another frame from there on, or a jump of the filter on board: use the parts before and after.", None
+    if marked:
+        advice = "Mark the samples away from the path as missing (--fix)."
+        fix = Fix("mark", (name,), rows=np.flatnonzero(flags))
+    yield Finding("numbers", Grade.DEGRADES, text, name, longest(spans), evidence, advice, fix)
 
 
 def _coarse(name: str, array: SignalArray, value: Array) -> Iterator[Finding]:
     """Finding if the position is stored in coarse steps."""
     grains = [_grain(column) for column in value.T]
-    known = [g for g in grains if math.isfinite(g)]
-    if not known or min(known) < COARSE_RESOLUTION:
+    grain = min((g for g in grains if math.isfinite(g)), default=0.0)
+    if grain < COARSE_RESOLUTION:
         return
-    grain = min(known)
     text = f"{name} is stored in steps of {100.0 * grain:.2g} cm."
     advice = f"Log it with more digits: a velocity over 0.1 s is known to no better than {grain / 0.1:.2g} m/s from it."
     yield Finding("numbers", Grade.HARMLESS, text, name, (), {"resolution_m": grain}, advice)

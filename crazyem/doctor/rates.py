@@ -6,7 +6,7 @@ import numpy as np
 
 from crazyem.doctor import axes
 from crazyem.doctor.hypotheses import Comparison, compare_hypotheses, misread, wrong_scale, wrong_unit
-from crazyem.doctor.kinematics import Pose, Track, grid_of, measurements, poses, rate_of_attitude, width_for
+from crazyem.doctor.kinematics import Track, grid_of, measurements, poses, rate_of_attitude, track, width_for
 from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
@@ -36,17 +36,15 @@ def check(recording: Recording) -> list[Finding]:
     found: list[Finding] = []
     attitudes = poses(recording)
     for name, array in measurements(recording, "body_rate").items():
-        looks = [one for pose in attitudes if (one := _compare(array, pose)) is not None]
+        looks = [one for pose in attitudes.items() if (one := _compare(array, *pose)) is not None]
         if looks:
             found += _judge(name, looks)
     return found
 
 
-def _compare(array: SignalArray, pose: Pose) -> Comparison | None:
-    grid = grid_of(array, pose.array)
-    if grid.size == 0:
-        return None
-    attitude = pose.track(grid)
+def _compare(array: SignalArray, pose: str, turning: SignalArray) -> Comparison | None:
+    grid = grid_of(array, turning)
+    attitude = track(turning, grid)
     body = rate_of_attitude(attitude)
     world = rotate(attitude.value, body.value)
     candidates = {
@@ -55,9 +53,8 @@ def _compare(array: SignalArray, pose: Pose) -> Comparison | None:
         "turned twice": (1, Track(rotate(attitude.value, body.value, inverse=True), body.valid)),
         "world, negated": (3, Track(-world, body.valid)),
     }
-    return compare_hypotheses(
-        array, grid, pose.name, candidates, width=max(RATE_WINDOW, width_for(array, pose.array)), least=LEAST_RATE_RMS
-    )
+    width = max(RATE_WINDOW, width_for(array, turning))
+    return compare_hypotheses(array, grid, pose, candidates, width=width, least=LEAST_RATE_RMS)
 
 
 def _judge(name: str, looks: list[Comparison]) -> list[Finding]:

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import linalg, stats
 
 Array = NDArray[np.float64]
 
@@ -31,10 +31,8 @@ class Slope:
     """The factor s of y = s x + offset, all components together.
 
     Attributes:
-        value: geometric mean of the two regressions.
-        direct: regression of y on x; noise of x makes it too small.
-        reverse: 1 / (regression of x on y); noise of y makes it too large. The true slope lies between the two if the
-            noises are independent.
+        value: geometric mean of two regressions: of y on x (noise of x makes it too small), and 1 / (that of x on y)
+            (noise of y makes it too large). The true slope lies between the two if the noises are independent.
         low, high: 95 % interval: from the lower to the higher regression, each widened by its jackknife error.
         far_low, far_high: the same at the level `SLOPE_CONFIDENCE`.
         explained: squared correlation.
@@ -43,8 +41,6 @@ class Slope:
     """
 
     value: float
-    direct: float
-    reverse: float
     low: float
     high: float
     far_low: float
@@ -79,14 +75,10 @@ def slope(x: Array, y: Array, block: NDArray[np.int64]) -> Slope | None:
     keep = np.ones(len(x), bool)
     for _ in range(3):
         sums = _moments(x[keep], y[keep], block[keep])
-        if sums is None:
+        both = _two(sums.sum(axis=0))
+        if both is None:
             return None
-        total = sums.sum(axis=0)
-        factor = _two(total)
-        if factor is None:
-            return None
-        middle = math.copysign(math.sqrt(abs(factor[0] * factor[1])), factor[0])
-        line = middle * (x - np.median(x[keep], axis=0))
+        line = _middle(both) * (x - np.median(x[keep], axis=0))
         away = np.linalg.norm((y - np.median(y[keep], axis=0)) - line, axis=1)
         limit = 5.0 * float(np.median(away[keep])) / 0.6745
         following = away <= np.maximum(limit, np.linalg.norm(line, axis=1) + 1e-12)
@@ -94,27 +86,19 @@ def slope(x: Array, y: Array, block: NDArray[np.int64]) -> Slope | None:
             break
         keep = following
     sums = _moments(x[keep], y[keep], block[keep])
-    if sums is None:
-        return None
     total = sums.sum(axis=0)
     both = _two(total)
-    count = len(sums)
-    if both is None or count < FEWEST_BLOCKS:
-        return None
     parts = [_two(total - one) for one in sums]
-    if any(p is None for p in parts):
+    if both is None or len(sums) < FEWEST_BLOCKS or any(p is None for p in parts):
         return None
-    left = np.array(parts)
-    spread = np.sqrt((count - 1) / count * np.square(left - left.mean(axis=0)).sum(axis=0))
+    spread = jackknife_error(np.array(parts))
     edges = []
     for level in (0.975, SLOPE_CONFIDENCE):
-        wide = float(stats.t.ppf(level, count - 1)) * spread
+        wide = float(stats.t.ppf(level, len(sums) - 1)) * spread
         edges.append((min(both[i] - wide[i] for i in (0, 1)), max(both[i] + wide[i] for i in (0, 1))))
-    sxx, sxy, syy = total[:3]
+    sxx, sxy, syy = total
     return Slope(
-        value=math.copysign(math.sqrt(both[0] * both[1]), both[0]),
-        direct=both[0],
-        reverse=both[1],
+        value=_middle(both),
         low=edges[0][0],
         high=edges[0][1],
         far_low=edges[1][0],
@@ -125,10 +109,15 @@ def slope(x: Array, y: Array, block: NDArray[np.int64]) -> Slope | None:
     )
 
 
-def _moments(x: Array, y: Array, block: NDArray[np.int64]) -> Array | None:
-    """(blocks, 3) sums of xx, xy, yy, about the mean."""
+def jackknife_error(left: Array) -> Array:
+    """Standard errors (...) from results (blocks, ...), each with one block left out."""
+    return np.asarray(np.sqrt((len(left) - 1) / len(left) * np.square(left - left.mean(axis=0)).sum(axis=0)), float)
+
+
+def _moments(x: Array, y: Array, block: NDArray[np.int64]) -> Array:
+    """(blocks, 3) sums of xx, xy, yy, about the mean; zero with fewer than 20 rows."""
     if len(x) < 20:
-        return None
+        return np.zeros((1, 3))
     x, y = x - x.mean(axis=0), y - y.mean(axis=0)
     number = np.asarray(np.unique(block, return_inverse=True)[1], np.int64)
     return block_sums(number, (x * x).sum(axis=1), (x * y).sum(axis=1), (y * y).sum(axis=1))
@@ -136,10 +125,15 @@ def _moments(x: Array, y: Array, block: NDArray[np.int64]) -> Array | None:
 
 def _two(total: Array) -> tuple[float, float] | None:
     """Direct and reverse slope from sums of xx, xy, yy."""
-    sxx, sxy, syy = (float(v) for v in total[:3])
+    sxx, sxy, syy = (float(v) for v in total)
     if sxx <= 0.0 or syy <= 0.0 or abs(sxy) <= 1e-9 * math.sqrt(sxx * syy):
         return None
     return sxy / sxx, syy / sxy
+
+
+def _middle(both: tuple[float, float]) -> float:
+    """Geometric mean of two slopes of one sign."""
+    return math.copysign(math.sqrt(both[0] * both[1]), both[0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +145,6 @@ class Choice:
         best: the hypothesis with the least unexplained variance.
         explained: share of the variance that each hypothesis explains.
         ratio: unexplained variance of the declared hypothesis over that of the best.
-        margin: unexplained variance of the best beaten hypothesis over that of the best.
         denied: the declared hypothesis is beaten with certainty.
     """
 
@@ -159,7 +152,6 @@ class Choice:
     best: str
     explained: Mapping[str, float]
     ratio: float
-    margin: float
     denied: bool
 
 
@@ -201,13 +193,11 @@ def choose(
     simple = min(candidates[name][0] for name in standing)
     names = [name for name in standing if candidates[name][0] == simple]
     declared = next(iter(candidates))
-    beaten = [float(left[name].sum()) for name in left if name not in standing]
     return Choice(
         name=names[0] if len(names) == 1 else "",
         best=best,
         explained={name: 1.0 - float(rest.sum()) / whole for name, rest in left.items()},
         ratio=float(left[declared].sum()) / least,
-        margin=min(beaten, default=math.nan) / least,
         denied=declared not in standing,
     )
 
@@ -245,20 +235,21 @@ def linear_fit(response: list[Array], columns: list[Array], *, share: float = 1.
     Args:
         response, columns: one array for each stretch of neighbouring rows; NaN where missing.
         share: share of these rows in the data; the standard deviations are those of all the data.
-        parts: number of equal parts that are also fitted separately. If their values scatter by more than their
-            standard deviations, the latter are widened (Birge 1932).
+        parts: number of equal parts that are also fitted separately, to widen the standard deviations (`widened`).
 
     Returns: None with too few rows or linearly dependent columns.
     """
     fit = _linear_fit_once(response, columns, share)
     if fit is None or parts < 2:
         return fit
-    off = []
-    for low, high in pairwise(np.linspace(0, sum(r.size for r in response), parts + 1).astype(int)):
-        pieces = _between(response, columns, int(low), int(high))
-        part = _linear_fit_once([r for r, _ in pieces], [c for _, c in pieces], share) if pieces else None
-        if part is not None:
-            off.append((part.value - fit.value) / part.sd)
+    edges = np.linspace(0, sum(r.size for r in response), parts + 1).astype(int)
+    pieces = [_between(response, columns, int(low), int(high)) for low, high in pairwise(edges)]
+    return widened(fit, [_linear_fit_once([r for r, _ in p], [c for _, c in p], share) for p in pieces if p])
+
+
+def widened(fit: Fit, parts: list[Fit | None]) -> Fit:
+    """A fit with sd widened where fits of its parts scatter by more than their errors (Birge 1932)."""
+    off = [(part.value - fit.value) / np.hypot(part.sd, part.bias) for part in parts if part is not None]
     ratio = np.sqrt(np.mean(np.square(off), axis=0)) if len(off) > 1 else np.ones(fit.value.size)
     return replace(fit, sd=fit.sd * np.maximum(ratio, 1.0))
 
@@ -311,8 +302,7 @@ def autoregression(parts: list[Array]) -> Array:
     if not covariance[0] > 0.0:
         return np.append(1.0, np.zeros(AUTOREGRESSION_ORDER))
     covariance[0] *= 1.0 + 1e-6
-    toeplitz = covariance[np.abs(np.subtract.outer(np.arange(AUTOREGRESSION_ORDER), np.arange(AUTOREGRESSION_ORDER)))]
-    return np.append(1.0, -np.linalg.solve(toeplitz, covariance[1:]))
+    return np.append(1.0, -np.linalg.solve(linalg.toeplitz(covariance[:-1]), covariance[1:]))
 
 
 def filtered(weights: Array, part: Array) -> Array:

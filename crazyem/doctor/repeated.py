@@ -5,17 +5,15 @@ small as a few resolutions. Coarse signals that repeat together with a fine one 
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crazyem.doctor.streams import COMMAND_SIGNALS, Stream, cadence, listed, places, runs, same_as_before, sole, streams
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
-from crazyem.recordings.ordering import inside, sound_rows
+from crazyem.recordings.ordering import Array, Flags, inside, sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
 
 # signals that may come from a slower firmware task than the rest of their table; the table then holds the last value
 _SLOW_SIGNALS = frozenset({"voltage", "motor_command", "motor_request", "rotor_speed"})
-Rows = NDArray[np.bool_]
 
 REPORTED_REPEAT_SHARE = 0.01  # smallest reported share of repeated rows
 DEGRADING_REPEAT_SHARE = 0.05  # share that degrades results: a repeat is a value that is one sample old
@@ -25,13 +23,8 @@ ONE_PACKET_SHARE = 0.9  # least share of common repeats of signals in one packet
 
 def check(recording: Recording) -> list[Finding]:
     """Findings about repeated rows of each stream, and about signals that are held between slower measurements."""
-    flight = airtime(recording)
-    found: list[Finding] = []
-    if not flight.airborne:
-        return found  # signals may repeat while the drone stands on the ground
-    for stream in streams(recording):
-        found += _stream(stream, flight)
-    return found
+    flight = airtime(recording)  # signals may repeat while the drone stands on the ground
+    return [finding for stream in streams(recording) for finding in _stream(stream, flight)] if flight.airborne else []
 
 
 def _stream(stream: Stream, flight: Airtime) -> list[Finding]:
@@ -41,7 +34,7 @@ def _stream(stream: Stream, flight: Airtime) -> list[Finding]:
     if considered.sum() < 50 or not stored > 0:
         return []
     considered[0] = False
-    same: dict[str, Rows] = {}
+    same: dict[str, Flags] = {}
     fine: list[str] = []
     found = []
     for name, array in zip(stream.names, stream.arrays, strict=True):
@@ -71,23 +64,20 @@ def _stream(stream: Stream, flight: Airtime) -> list[Finding]:
     return found
 
 
-def _follows(flags: Rows, rows: Rows) -> bool:
+def _follows(flags: Flags, rows: Flags) -> bool:
     """True if a signal repeats in (nearly) all of the rows."""
     return bool((flags & rows).sum() >= ONE_PACKET_SHARE * rows.sum())
 
 
-def _resting(array: SignalArray) -> Rows:
+def _resting(array: SignalArray) -> Flags:
     """(n,) True where all commands are at their least or greatest value, at which they may stay."""
-    if array.quantity not in ("motor_command", "motor_request"):
-        return np.zeros(array.time.size, bool)
     sound = array.value[np.isfinite(array.value)]
-    if sound.size == 0:
+    if array.quantity not in ("motor_command", "motor_request") or sound.size == 0:
         return np.zeros(array.time.size, bool)
-    low, high = sound.min(), sound.max()
-    return ((array.value == low) | (array.value == high)).all(axis=1)
+    return ((array.value == sound.min()) | (array.value == sound.max())).all(axis=1)
 
 
-def _is_fine(array: SignalArray, considered: Rows) -> bool:
+def _is_fine(array: SignalArray, considered: Flags) -> bool:
     """True if the signal cannot repeat by chance: almost none of its steps is as small as its resolution.
 
     A compressed quaternion has three coarse components, and the fourth follows from them. So three must be fine.
@@ -103,7 +93,7 @@ def _is_fine(array: SignalArray, considered: Rows) -> bool:
     return fine >= (3 if array.quantity == "attitude" else 1)
 
 
-def _hold(same: Rows, considered: Rows) -> float | None:
+def _hold(same: Flags, considered: Flags) -> float | None:
     """Period of the changes [rows] if it is regular and at least 1.5, else None."""
     changes = np.flatnonzero(~same & considered)
     if changes.size < 10:
@@ -140,26 +130,19 @@ def _held_finding(name: str, share: float, stored: float, beat: float) -> Findin
 
 
 def _finding(
-    names: list[str], time: NDArray[np.float64], rows: Rows, considered: Rows, stored: float, *, whole_table: bool
+    names: list[str], time: Array, rows: Flags, considered: Flags, stored: float, *, whole_table: bool
 ) -> Finding:
     share = float(rows[considered].mean())
     rate = stored * (1.0 - share)
     lengths = np.diff(runs(rows), axis=1)
     what = "whole rows" if whole_table else "values"
-    return Finding(
-        "repeated",
-        Grade.DEGRADES if share > DEGRADING_REPEAT_SHARE else Grade.HARMLESS,
+    text = (
         f"{percent(share)} of the {what} of {listed(names)} in flight repeat the one before: "
-        f"stored at {stored:.0f} Hz, measured at about {rate:.0f} Hz.",
-        signal=sole(names),
-        intervals=places(time, rows),
-        evidence={
-            "samples": int(rows.sum()),
-            "share": share,
-            "rate_hz": rate,
-            "stored_hz": stored,
-            "longest_samples": float(lengths.max()),
-        },
-        advice="Mark the repeats as missing (--fix); they are old values with a new stamp.",
-        fix=Fix("mark", tuple(names), rows=np.flatnonzero(rows)),
+        f"stored at {stored:.0f} Hz, measured at about {rate:.0f} Hz."
     )
+    evidence = {"samples": int(rows.sum()), "share": share, "rate_hz": rate, "stored_hz": stored}
+    evidence["longest_samples"] = float(lengths.max())
+    advice = "Mark the repeats as missing (--fix); they are old values with a new stamp."
+    fix = Fix("mark", tuple(names), rows=np.flatnonzero(rows))
+    grade = Grade.DEGRADES if share > DEGRADING_REPEAT_SHARE else Grade.HARMLESS
+    return Finding("repeated", grade, text, sole(names), places(time, rows), evidence, advice, fix)

@@ -15,22 +15,11 @@ from numpy.typing import NDArray
 from crazyem.doctor.streams import cadence, listed, longest, runs
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.finding import Finding, Fix, Grade, intervals_of, percent
-from crazyem.recordings.ordering import Intervals, inside, ordered
+from crazyem.recordings.ordering import Array, Flags, Intervals, inside, ordered
 from crazyem.recordings.recording import Recording, SignalArray
 
-COUNTED_FRACTIONS: dict[str, float] = {
-    "a quarter": 1 / 4,
-    "a third": 1 / 3,
-    "half": 1 / 2,
-    "twice": 2.0,
-    "three times": 3.0,
-}
-CONSTANT_FRACTIONS: dict[str, float] = {
-    **COUNTED_FRACTIONS,
-    "two thirds": 2 / 3,
-    "three quarters": 3 / 4,
-    "one and a half times": 3 / 2,
-}
+COUNTED_FRACTIONS = {"a quarter": 1 / 4, "a third": 1 / 3, "half": 1 / 2, "twice": 2.0, "three times": 3.0}
+CONSTANT_FRACTIONS = {**COUNTED_FRACTIONS, "two thirds": 2 / 3, "three quarters": 3 / 4, "one and a half times": 3 / 2}
 JUMP_TOLERANCE = 0.15  # largest relative deviation of a jump from the fraction
 SPEED_TOLERANCE = 0.35  # the same of the speed from the expected speed: rotors lag, and they differ
 # The same for a whole flight: rotors of one drone differ by some 3 %. The second: largest distance to a fraction, as a
@@ -57,7 +46,7 @@ def check(recording: Recording) -> list[Finding]:
     return found
 
 
-def _signal(recording: Recording, name: str, array: SignalArray, rows: NDArray[np.bool_]) -> list[Finding]:
+def _signal(recording: Recording, name: str, array: SignalArray, rows: Flags) -> list[Finding]:
     speed = array.value
     expected = _expected(recording, array, rows)
     if expected is None:
@@ -77,18 +66,18 @@ def _signal(recording: Recording, name: str, array: SignalArray, rows: NDArray[n
         if zero.any():
             found.append(_finding(name, array, rotor, zero, "zero", 0.0, rows))
         if sampled and not whole:
-            position_jumps = _jumps(array.time, np.abs(speed[:, rotor]), own, rows)
-            if position_jumps is None:
+            jumps = _jumps(array.time, np.abs(speed[:, rotor]), own, rows)
+            if jumps is None:
                 continue
             for words, fraction in COUNTED_FRACTIONS.items():
                 flags = np.zeros(array.time.size, bool)
-                flags[_between(position_jumps, fraction)] = True
+                flags[_between(jumps, fraction)] = True
                 if flags.any():
                     found.append(_finding(name, array, rotor, flags, words, fraction, rows))
     return [*found, *_missing(name, array, rows)]
 
 
-def _expected(recording: Recording, array: SignalArray, rows: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+def _expected(recording: Recording, array: SignalArray, rows: Flags) -> Array | None:
     """(n, c) rad/s, the expected speed of each rotor; None if it is unknown."""
     speed = np.abs(array.value)
     command = recording.signals.get("motor_command")
@@ -102,10 +91,10 @@ def _expected(recording: Recording, array: SignalArray, rows: NDArray[np.bool_])
         if time.size >= 50:
             drive = np.column_stack([np.interp(array.time, time, column * volts) for column in duty.T])
             return _law(drive, speed, rows)
-    return _from_the_others(speed, rows)
+    return _from_the_others(speed)
 
 
-def _law(drive: NDArray[np.float64], speed: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _law(drive: Array, speed: Array, rows: Flags) -> Array:
     """Expected speed (n, c) = a + b drive, with one law for all rotors, so that a faulty sensor does not fit itself.
 
     b is the median slope over random pairs (Theil-Sen), so it is robust against outliers.
@@ -119,15 +108,12 @@ def _law(drive: NDArray[np.float64], speed: NDArray[np.float64], rows: NDArray[n
     dx = x[thin[:, 0]] - x[thin[:, 1]]
     dy = y[thin[:, 0]] - y[thin[:, 1]]
     apart = np.abs(dx) > 0.1 * float(np.percentile(x, 95))
-    slope = float(np.median(dy[apart] / dx[apart])) if apart.sum() > 50 else 0.0
-    if slope <= 0:
-        slope = 0.0
+    slope = max(float(np.median(dy[apart] / dx[apart])), 0.0) if apart.sum() > 50 else 0.0
     level = float(np.median(y - slope * x))
-    expected: NDArray[np.float64] = np.maximum(level + slope * drive, 0.2 * float(np.median(y)))
-    return expected
+    return np.maximum(level + slope * drive, 0.2 * float(np.median(y)))
 
 
-def _from_the_others(speed: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+def _from_the_others(speed: Array) -> Array | None:
     """(n, c) the median speed of the other rotors; None with fewer than three rotors."""
     count = speed.shape[1]
     if count < 3:
@@ -142,22 +128,14 @@ def _from_the_others(speed: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDA
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Jumps:
-    """The known samples of a rotor.
+    """The known samples of a rotor."""
 
-    Attributes:
-        rows: (k,) their row numbers.
-        ratio: (k,) speed over expected speed.
-        leap: (k - 1,) speed over the speed of the sample before; NaN across a gap.
-    """
-
-    rows: NDArray[np.int64]
-    ratio: NDArray[np.float64]
-    leap: NDArray[np.float64]
+    rows: NDArray[np.int64]  # (k,) their row numbers
+    ratio: Array  # (k,) speed over expected speed
+    leap: Array  # (k - 1,) speed over the speed of the sample before; NaN across a gap
 
 
-def _jumps(
-    time: NDArray[np.float64], speed: NDArray[np.float64], ratio: NDArray[np.float64], rows: NDArray[np.bool_]
-) -> _Jumps | None:
+def _jumps(time: Array, speed: Array, ratio: Array, rows: Flags) -> _Jumps | None:
     """The known samples and their speed ratios; None if the speed never jumps."""
     known = np.flatnonzero(rows & (speed > 0) & np.isfinite(ratio))
     if known.size < 3:
@@ -167,13 +145,13 @@ def _jumps(
     return _Jumps(known, ratio[known], leap) if ((leap < 0.6) | (leap > 1.7)).any() else None
 
 
-def _between(position_jumps: _Jumps, fraction: float) -> NDArray[np.int64]:
+def _between(jumps: _Jumps, fraction: float) -> NDArray[np.int64]:
     """Rows of stretches at a fraction of the expected speed that begin and end with a jump."""
-    starts = np.flatnonzero(np.abs(position_jumps.leap / fraction - 1.0) < JUMP_TOLERANCE)
-    ends = np.flatnonzero(np.abs(position_jumps.leap * fraction - 1.0) < JUMP_TOLERANCE)
-    near = np.abs(position_jumps.ratio / fraction - 1.0) < SPEED_TOLERANCE
-    normal = np.abs(position_jumps.ratio - 1.0) < SPEED_TOLERANCE
-    last = position_jumps.rows.size - 1
+    starts = np.flatnonzero(np.abs(jumps.leap / fraction - 1.0) < JUMP_TOLERANCE)
+    ends = np.flatnonzero(np.abs(jumps.leap * fraction - 1.0) < JUMP_TOLERANCE)
+    near = np.abs(jumps.ratio / fraction - 1.0) < SPEED_TOLERANCE
+    normal = np.abs(jumps.ratio - 1.0) < SPEED_TOLERANCE
+    last = jumps.rows.size - 1
     found = [np.empty(0, np.int64)]
     after = 0
     for start in starts[:_MOST_JUMPS]:
@@ -183,12 +161,12 @@ def _between(position_jumps: _Jumps, fraction: float) -> NDArray[np.int64]:
         # up to the jump back, or to the end of the flight
         end = int(ends[place]) if place < ends.size else last
         if near[start + 1 : end + 1].mean() > 0.8 and (place == ends.size or normal[min(end + 1, last)]):
-            found.append(position_jumps.rows[start + 1 : end + 1])
+            found.append(jumps.rows[start + 1 : end + 1])
             after = end + 1
     return np.concatenate(found)
 
 
-def _stopped(ratio: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _stopped(ratio: Array, rows: Flags) -> Flags:
     """(n,) True where a rotor reads zero that turns before or after.
 
     `ratio` (n,) is the speed over the usual speed by this sensor; NaN is no evidence.
@@ -203,7 +181,7 @@ def _stopped(ratio: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.
     return flags & rows
 
 
-def _constant_fraction(ratio: NDArray[np.float64]) -> str:
+def _constant_fraction(ratio: Array) -> str:
     """The fraction that a sensor counts during the whole flight; "" if it counts correctly."""
     sound = ratio[np.isfinite(ratio)]
     if sound.size < 50:
@@ -228,37 +206,21 @@ def _constant(name: str, array: SignalArray, rotor: int, words: str, ratio: floa
 
 
 def _finding(
-    name: str,
-    array: SignalArray,
-    rotor: int,
-    flags: NDArray[np.bool_],
-    words: str,
-    fraction: float,
-    rows: NDArray[np.bool_],
+    name: str, array: SignalArray, rotor: int, flags: Flags, words: str, fraction: float, rows: Flags
 ) -> Finding:
     share = float(flags.sum()) / float(rows.sum())
     spans = intervals_of(array.time, flags)
     what = "drops to zero while the rotor must turn" if fraction == 0.0 else f"counts {words} of the turns"
-    return Finding(
-        "rotor_sensor",
-        Grade.DEGRADES if share >= DEGRADING_MISCOUNT_SHARE else Grade.HARMLESS,
-        f"The speed sensor of m{rotor + 1} {what} in {len(spans)} stretches, {percent(share)} of the flight.",
-        signal=name,
-        intervals=longest(spans),
-        evidence={
-            "rotor": rotor + 1,
-            "ratio": fraction,
-            "share": share,
-            "samples": int(flags.sum()),
-            "stretches": len(spans),
-            "longest_s": max(b - a for a, b in spans),
-        },
-        advice="Mark these samples as missing (--fix).",
-        fix=Fix("mark", (name,), rows=np.flatnonzero(flags)),
-    )
+    grade = Grade.DEGRADES if share >= DEGRADING_MISCOUNT_SHARE else Grade.HARMLESS
+    text = f"The speed sensor of m{rotor + 1} {what} in {len(spans)} stretches, {percent(share)} of the flight."
+    evidence = {"rotor": rotor + 1, "ratio": fraction, "share": share, "samples": int(flags.sum())}
+    evidence |= {"stretches": len(spans), "longest_s": max(b - a for a, b in spans)}
+    fix = Fix("mark", (name,), rows=np.flatnonzero(flags))
+    advice = "Mark these samples as missing (--fix)."
+    return Finding("rotor_sensor", grade, text, name, longest(spans), evidence, advice, fix)
 
 
-def _missing(name: str, array: SignalArray, rows: NDArray[np.bool_]) -> Iterator[Finding]:
+def _missing(name: str, array: SignalArray, rows: Flags) -> Iterator[Finding]:
     """Finding about samples that the sensor reported as unknown, one for all rotors."""
     nan = ~np.isfinite(array.value)
     flags = nan.any(axis=1) & array.marked & rows

@@ -1,14 +1,14 @@
 """Check: rotors at their upper or lower limit in flight."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crazyem.doctor.streams import longest, runs
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Grade, intervals_of, percent
-from crazyem.recordings.ordering import Intervals, inside, ordered
+from crazyem.recordings.ordering import Array, Flags, Intervals, inside, ordered
 from crazyem.recordings.recording import Recording
 
 FULL_DUTY = 0.999  # share of the largest duty that counts as full
@@ -37,9 +37,7 @@ def check(recording: Recording) -> list[Finding]:
     return found
 
 
-def _upper(
-    recording: Recording, name: str, time: NDArray[np.float64], value: NDArray[np.float64], rows: NDArray[np.bool_]
-) -> Iterator[Finding]:
+def _upper(recording: Recording, name: str, time: Array, value: Array, rows: Flags) -> Iterator[Finding]:
     flags = np.zeros(value.shape, bool)
     ceilings = []
     for rotor, column in enumerate(value.T):
@@ -49,21 +47,17 @@ def _upper(
         elif top > 0.5 and _is_ceiling(column, top, rows):
             flags[:, rotor] = (column == top) & rows
             ceilings.append(top)
-    shares = flags[rows].mean(axis=0)
     if not flags.any():
         return
-    any_rotor: NDArray[np.bool_] = np.logical_or.reduce(flags, axis=1)
-    share = float(any_rotor[rows].mean())
+    any_rotor: Flags = np.logical_or.reduce(flags, axis=1)
+    share, shares, words = _shares(flags[rows])
     spans = intervals_of(time, any_rotor)
-    lasting = max(b - a for a, b in spans)
-    evidence: dict[str, float] = {"share": share, "longest_s": lasting}
-    evidence |= {f"share_m{i + 1}": float(s) for i, s in enumerate(shares)}
+    evidence = {"share": share, "longest_s": max(b - a for a, b in spans), **shares}
     if ceilings:
         evidence["ceiling"] = min(ceilings)
-    words = ", ".join(f"m{i + 1} {percent(s)}" for i, s in enumerate(shares) if s > 0)
     text = f"The {_COMMAND_WORDS[name]} of a rotor is at its upper limit in {percent(share)} of the flight ({words})"
     volts = _voltage(recording, time[any_rotor])
-    if np.isfinite(volts):
+    if math.isfinite(volts):
         evidence["voltage_V"] = volts
         if volts / max(1, round(volts / 3.8)) < LOW_CELL:
             text += f", on a low battery ({volts:.2f} V)"
@@ -75,7 +69,14 @@ def _upper(
     yield Finding("saturation", grade, text + ".", name, longest(spans), evidence, advice)
 
 
-def _is_ceiling(column: NDArray[np.float64], top: float, rows: NDArray[np.bool_]) -> bool:
+def _shares(flags: Flags) -> tuple[float, dict[str, float], str]:
+    """Share of the samples (n, c) with any rotor at a limit, share of each rotor, and the latter in words."""
+    shares = {f"m{i + 1}": float(share) for i, share in enumerate(flags.mean(axis=0))}
+    words = ", ".join(f"{rotor} {percent(share)}" for rotor, share in shares.items() if share > 0)
+    return float(flags.any(axis=1).mean()), {f"share_{rotor}": share for rotor, share in shares.items()}, words
+
+
+def _is_ceiling(column: Array, top: float, rows: Flags) -> bool:
     """True if the largest value is a limit: too frequent, and too long at a time, for a maximum of a coarse signal."""
     at_top = (column == top) & rows
     count = int(at_top.sum())
@@ -85,9 +86,7 @@ def _is_ceiling(column: NDArray[np.float64], top: float, rows: NDArray[np.bool_]
     return often and bool((spans[:, 1] - spans[:, 0]).max() >= _CEILING_RUN)
 
 
-def _lower(
-    name: str, time: NDArray[np.float64], value: NDArray[np.float64], rows: NDArray[np.bool_], flight: Airtime
-) -> Iterator[Finding]:
+def _lower(name: str, time: Array, value: Array, rows: Flags, flight: Airtime) -> Iterator[Finding]:
     """Finding about rotors at idle or off while airborne, without the first and last 0.5 s (start and stop)."""
     inner: Intervals = tuple((a + 0.5, b - 0.5) for a, b in flight.airborne if b - a > 1.5)
     rows = rows & inside(time, inner)
@@ -102,35 +101,21 @@ def _lower(
         # the lower limit is common to all four rotors: idle or zero
         if low <= max(idle, floor) * (1.0 + 1e-6) and low < 0.35:
             flags[:, rotor] = (column <= low * (1.0 + 1e-6)) & rows
-    any_rotor: NDArray[np.bool_] = np.logical_or.reduce(flags, axis=1)
-    share = float(any_rotor[rows].mean())
+    any_rotor: Flags = np.logical_or.reduce(flags, axis=1)
+    share, shares, words = _shares(flags[rows])
     if any_rotor.sum() < 3 or share < 5e-4:
         return
-    shares = flags[rows].mean(axis=0)
     spans = intervals_of(time, any_rotor)
-    words = ", ".join(f"m{i + 1} {percent(s)}" for i, s in enumerate(shares) if s > 0)
-    yield Finding(
-        "saturation",
-        Grade.DEGRADES if share >= 4.0 * DEGRADING_SATURATED_SHARE else Grade.HARMLESS,
-        f"The {_COMMAND_WORDS[name]} of a rotor is at its lower limit in {percent(share)} of the flight ({words}).",
-        signal=name,
-        intervals=longest(spans),
-        evidence={
-            "share": share,
-            "longest_s": max(b - a for a, b in spans),
-            "floor": float(value[any_rotor].min()),
-            **{f"share_m{i + 1}": float(s) for i, s in enumerate(shares)},
-        },
-        advice="At idle the thrust law is least certain; leave these stretches out of fits of the thrust curve.",
-    )
+    grade = Grade.DEGRADES if share >= 4.0 * DEGRADING_SATURATED_SHARE else Grade.HARMLESS
+    text = f"The {_COMMAND_WORDS[name]} of a rotor is at its lower limit in {percent(share)} of the flight ({words})."
+    lasting = max(b - a for a, b in spans)
+    evidence = {"share": share, "longest_s": lasting, "floor": float(value[any_rotor].min()), **shares}
+    advice = "At idle the thrust law is least certain; leave these stretches out of fits of the thrust curve."
+    yield Finding("saturation", grade, text, name, longest(spans), evidence, advice)
 
 
-def _voltage(recording: Recording, times: NDArray[np.float64]) -> float:
-    """Median voltage at these times; NaN without a voltage on the same clock."""
+def _voltage(recording: Recording, times: Array) -> float:
+    """Median voltage at these times; NaN without a voltage."""
     array = recording.signals.get("voltage")
-    if array is None or array.time.size < 2:
-        return float("nan")
-    time, value = ordered(array)
-    if time.size < 2:
-        return float("nan")
-    return float(np.median(np.interp(times, time, value[:, 0])))
+    time, value = ordered(array) if array is not None else (np.empty(0), np.empty((0, 1)))
+    return float(np.median(np.interp(times, time, value[:, 0]))) if time.size >= 2 else math.nan

@@ -15,18 +15,10 @@ from crazyem.recordings.recording import Recording, SignalArray
 MOST_INTERVALS = 50  # most intervals in a finding, the longest ones; its evidence counts all
 
 # Commands, not measurements: they may be straight, constant or stepped without a fault.
-COMMAND_SIGNALS = frozenset(
-    {
-        "setpoint_position",
-        "setpoint_velocity",
-        "setpoint_acceleration",
-        "setpoint_euler",
-        "setpoint_rate",
-        "wrench_command",
-        "mixer_command",
-        "flying",
-    }
-)
+COMMAND_SIGNALS = frozenset({
+    "setpoint_position", "setpoint_velocity", "setpoint_acceleration", "setpoint_euler", "setpoint_rate",
+    "wrench_command", "mixer_command", "flying",
+})  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,12 +149,7 @@ def _refined(time: NDArray[np.float64], period: float) -> float:
 
 def runs(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
     """(k, 2) first row and row after the last of each run of True in (n,) flags."""
-    edges = np.flatnonzero(flags[1:] != flags[:-1]) + 1 if flags.size else np.empty(0, np.int64)
-    if flags.size and flags[0]:
-        edges = np.concatenate([[0], edges])
-    if edges.size % 2:
-        edges = np.concatenate([edges, [flags.size]])
-    return edges.reshape(-1, 2).astype(np.int64)
+    return np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)
 
 
 def longest(intervals: Iterable[tuple[float, float]]) -> Intervals:
@@ -179,10 +166,7 @@ def places(time: NDArray[np.float64], flags: NDArray[np.bool_]) -> Intervals:
 def same_as_before(value: NDArray[np.float64]) -> NDArray[np.bool_]:
     """(n,) True where a row of (n, c) equals the one before in every component; NaN equals nothing."""
     same = np.zeros(value.shape[0], bool)
-    if value.shape[0] > 1:
-        same[1:] = value[1:, 0] == value[:-1, 0]
-        for column in range(1, value.shape[1]):
-            same[1:] &= value[1:, column] == value[:-1, column]
+    same[1:] = np.logical_and.reduce([column[1:] == column[:-1] for column in value.T])
     return same
 
 

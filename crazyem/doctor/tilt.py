@@ -16,7 +16,6 @@ from crazyem.doctor.kinematics import (
     GRAVITY,
     UP,
     Grid,
-    Pose,
     Track,
     Window,
     difference,
@@ -28,7 +27,7 @@ from crazyem.doctor.kinematics import (
     track,
     width_for,
 )
-from crazyem.doctor.regression import FEWEST_BLOCKS, SLOPE_CONFIDENCE, blocks
+from crazyem.doctor.regression import FEWEST_BLOCKS, SLOPE_CONFIDENCE, blocks, jackknife_error
 from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording, SignalArray
@@ -45,25 +44,18 @@ LARGEST_HALF_WIDTH = math.radians(0.5)  # largest 95 % half-width with which til
 
 def check(recording: Recording) -> list[Finding]:
     """Findings about every attitude that can be compared with an accelerometer."""
-    forces = measurements(recording, "specific_force")
-    found: list[Finding] = []
-    for pose in poses(recording):
-        for name, array in forces.items():
-            if (finding := _look(recording, pose, name, array)) is not None:
-                found.append(finding)
-            break
-    return found
+    force = next(iter(measurements(recording, "specific_force").items()), None)
+    if force is None:
+        return []
+    looks = [_look(recording, *pose, *force) for pose in poses(recording).items()]
+    return [finding for finding in looks if finding is not None]
 
 
-def _look(recording: Recording, pose: Pose, name: str, array: SignalArray) -> Finding | None:
+def _look(recording: Recording, pose: str, turning: SignalArray, name: str, array: SignalArray) -> Finding | None:
     moving = _velocity(recording, pose)
-    grid = grid_of(array, pose.array, *([moving] if moving is not None else []))
-    if grid.size == 0:
-        return None
-    rest = _residual(recording, pose, array, moving, grid)
-    if rest is None:
-        return None
-    attitude, world = rest
+    grid = grid_of(array, turning, *moving)
+    attitude = track(turning, grid)
+    world = _residual(recording, attitude, array, moving, grid, max(0.5, width_for(array, turning)))
     rows = np.flatnonzero(world.valid & attitude.valid)[::5]
     if rows.size < 100:
         return None
@@ -79,40 +71,36 @@ def _look(recording: Recording, pose: Pose, name: str, array: SignalArray) -> Fi
     both, spread = _jackknife(design, e, block)
     if not _separable(design):
         spread = np.full_like(spread, np.inf)
-    return _judge(pose.name, name, both, spread, _jackknife(_design(q, both=False), e, block), count)
+    return _judge(pose, name, both, spread, _jackknife(_design(q, both=False), e, block), count)
 
 
-def _velocity(recording: Recording, pose: Pose) -> SignalArray | None:
-    """The velocity of the pose's origin, else the first velocity; None if there is none."""
+def _velocity(recording: Recording, pose: str) -> list[SignalArray]:
+    """The velocity of the pose's origin, else the first velocity; empty if there is none."""
     found = measurements(recording, "velocity")
-    same = [array for name, array in found.items() if origin_of(name) == origin_of(pose.name)]
-    return next(iter([*same, *found.values()]), None)
+    same = [array for name, array in found.items() if origin_of(name) == origin_of(pose)]
+    return [*same, *found.values()][:1]
 
 
 def _residual(
-    recording: Recording, pose: Pose, array: SignalArray, moving: SignalArray | None, grid: Grid
-) -> tuple[Track, Track] | None:
-    """Attitude, and R f - dv/dt - g e3 smoothed, both on the grid."""
-    attitude = pose.track(grid)
-    window = Window(max(0.5, width_for(array, pose.array)))
-    shift = _lag(recording, pose, array, grid)
-    force = track(array, grid, shift=shift)
-    turned = Track(rotate(attitude.value, force.value), attitude.valid & force.valid)
-    felt = window.mean(turned)
-    if moving is None:
-        acceleration = Track(np.zeros_like(felt.value), felt.valid)
-    else:
-        acceleration = window.mean(difference(track(moving, grid)))
-    valid = felt.valid & acceleration.valid
-    return attitude, Track(felt.value - acceleration.value - GRAVITY * UP, valid)
+    recording: Recording, attitude: Track, array: SignalArray, moving: list[SignalArray], grid: Grid, width: float
+) -> Track:
+    """R f - dv/dt - g e3 on the grid, smoothed; without a velocity R f - g e3."""
+    window = Window(width)
+    force = track(array, grid, shift=_lag(recording, attitude, array, grid))
+    felt = window.mean(Track(rotate(attitude.value, force.value), attitude.valid & force.valid))
+    value, valid = felt.value, felt.valid
+    for velocity in moving:
+        acceleration = window.mean(difference(track(velocity, grid)))
+        value, valid = value - acceleration.value, valid & acceleration.valid
+    return Track(value - GRAVITY * UP, valid)
 
 
-def _lag(recording: Recording, pose: Pose, array: SignalArray, grid: Grid) -> float:
+def _lag(recording: Recording, attitude: Track, array: SignalArray, grid: Grid) -> float:
     """Delay of the accelerometer [s]: that of the gyro of the same stream, against the attitude; 0 if unknown."""
     for gyro in measurements(recording, "body_rate").values():
         if gyro.stream == array.stream and gyro.time.size == array.time.size:
             window = Window(0.24)
-            late = delay(window.mean(rate_of_attitude(pose.track(grid))), window.mean(track(gyro, grid)))
+            late = delay(window.mean(rate_of_attitude(attitude)), window.mean(track(gyro, grid)))
             return 0.0 if late is None or late.at_edge or late.explained < 0.3 else late.value
     return 0.0
 
@@ -136,19 +124,13 @@ def _separable(a: Array) -> bool:
 
 def _jackknife(a: Array, e: Array, block: NDArray[np.int64]) -> tuple[Array, Array]:
     """Least squares of a x = e over rows, and standard errors by leaving out blocks."""
-    count, k = int(block.max()) + 1, a.shape[2]
-    normal, right = np.zeros((count, k, k)), np.zeros((count, k))
-    for b in range(count):
-        mine = block == b
-        normal[b] = np.einsum("nij,nik->jk", a[mine], a[mine])
-        right[b] = np.einsum("nij,ni->j", a[mine], e[mine])
-    ridge = 1e-9 * np.eye(k) * np.trace(normal.sum(axis=0))
-    whole = np.linalg.solve(normal.sum(axis=0) + ridge, right.sum(axis=0))
-    left = np.array(
-        [np.linalg.solve(normal.sum(axis=0) - normal[b] + ridge, right.sum(axis=0) - right[b]) for b in range(count)]
-    )
-    spread = np.sqrt((count - 1) / count * np.square(left - left.mean(axis=0)).sum(axis=0))
-    return whole, spread
+    parts = [(a[block == b], e[block == b]) for b in range(int(block.max()) + 1)]
+    normal = np.array([np.einsum("nij,nik->jk", rows, rows) for rows, _ in parts])
+    right = np.array([np.einsum("nij,ni->j", rows, rest) for rows, rest in parts])
+    matrix, vector = normal.sum(axis=0), right.sum(axis=0)
+    ridge = 1e-9 * np.eye(len(matrix)) * np.trace(matrix)
+    left = np.array([np.linalg.solve(matrix - n + ridge, vector - r) for n, r in zip(normal, right)])
+    return np.linalg.solve(matrix + ridge, vector), jackknife_error(left)
 
 
 def _judge(pose: str, force: str, both: Array, spread: Array, alone: tuple[Array, Array], count: int) -> Finding | None:

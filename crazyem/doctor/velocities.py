@@ -2,7 +2,7 @@
 
 from crazyem.doctor import axes
 from crazyem.doctor.hypotheses import Comparison, agreed_scale, compare_hypotheses, misread, wrong_scale, wrong_unit
-from crazyem.doctor.kinematics import Pose, Track, difference, grid_of, measurements, poses, track, width_for
+from crazyem.doctor.kinematics import Track, difference, grid_of, measurements, poses, track, width_for
 from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording, SignalArray
@@ -21,32 +21,27 @@ _MISREAD = {"body": ("it is in the body frame, not the world frame", "Rotate it 
 def check(recording: Recording) -> list[Finding]:
     """Findings about every velocity (against every position), and about every position but the first."""
     positions = measurements(recording, "position")
-    attitudes = poses(recording)
+    attitudes = list(poses(recording).values())[:1]
     found: list[Finding] = []
     blamed: set[str] = set()
     for name, array in measurements(recording, "velocity").items():
-        looks = [
-            one
-            for other, reference in positions.items()
-            if (one := _compare(array, other, reference, attitudes)) is not None
-        ]
-        found += _judge(name, looks, blamed)
+        looks = [_compare(array, *position, attitudes) for position in positions.items()]
+        found += _judge(name, [one for one in looks if one is not None], blamed)
     first = next(iter(positions), "")
     for name, array in positions.items():
         if name not in (first, *blamed) and first not in blamed:
-            one = _compare_positions(array, first, positions[first])
-            found += _judge_position(name, [one] if one else [], blamed)
+            seen = _compare_positions(array, first, positions[first])
+            if seen is not None:
+                found += _judge_position(name, seen, blamed)
     return found
 
 
-def _compare(array: SignalArray, other: str, reference: SignalArray, attitudes: list[Pose]) -> Comparison | None:
-    grid = grid_of(array, reference, *(pose.array for pose in attitudes[:1]))
-    if grid.size == 0:
-        return None
+def _compare(array: SignalArray, other: str, reference: SignalArray, attitudes: list[SignalArray]) -> Comparison | None:
+    grid = grid_of(array, reference, *attitudes)
     world = difference(track(reference, grid))
     candidates: dict[str, tuple[int, Track]] = {"world": (0, world)}
-    for pose in attitudes[:1]:
-        attitude = pose.track(grid)
+    for turning in attitudes:
+        attitude = track(turning, grid)
         turned = rotate(attitude.value, world.value, inverse=True)
         candidates["body"] = (1, Track(turned, world.valid & attitude.valid))
     width = max(VELOCITY_WINDOW, width_for(array, reference))
@@ -56,17 +51,9 @@ def _compare(array: SignalArray, other: str, reference: SignalArray, attitudes: 
 def _compare_positions(array: SignalArray, other: str, reference: SignalArray) -> Comparison | None:
     """Comparison of positions, not of their derivatives: late packets distort the scale of a derivative."""
     grid = grid_of(array, reference)
-    if grid.size == 0:
-        return None
     candidates = {"world": (0, track(reference, grid))}
-    return compare_hypotheses(
-        array,
-        grid,
-        other,
-        candidates,
-        width=max(VELOCITY_WINDOW, width_for(array, reference)),
-        least=LEAST_POSITION_RMS,
-    )
+    width = max(VELOCITY_WINDOW, width_for(array, reference))
+    return compare_hypotheses(array, grid, other, candidates, width=width, least=LEAST_POSITION_RMS)
 
 
 def _judge(name: str, looks: list[Comparison], blamed: set[str]) -> list[Finding]:
@@ -98,11 +85,10 @@ def _judge(name: str, looks: list[Comparison], blamed: set[str]) -> list[Finding
     )  # fmt: skip
 
 
-def _judge_position(name: str, looks: list[Comparison], blamed: set[str]) -> list[Finding]:
-    if not looks or looks[0].whole is None or looks[0].explained < LEAST_EXPLAINED_SHARE:
+def _judge_position(name: str, seen: Comparison, blamed: set[str]) -> list[Finding]:
+    whole = seen.whole
+    if whole is None or seen.explained < LEAST_EXPLAINED_SHARE:
         return []
-    seen, whole = looks[0], looks[0].whole
-    assert whole is not None
     head = f"{name} against {seen.against}: "
     if seen.choice.denied:
         return [misread("velocities", name, seen, _MISREAD, noun="world", what="")]
@@ -117,7 +103,7 @@ def _judge_position(name: str, looks: list[Comparison], blamed: set[str]) -> lis
     if unit:
         text = f"{head}it is {whole.value:.4g} times as large: it is in {unit[0]}, not m."
         return [wrong_unit("velocities", name, text, unit[1], seen.evidence())]
-    agreed = agreed_scale(looks, SCALE_FAULT)
+    agreed = agreed_scale([seen], SCALE_FAULT)
     if agreed is None:
         return []
     numbers = {**seen.evidence(), **axes.numbers(seen.single)}

@@ -15,7 +15,7 @@ from crazyem.doctor.regression import FEWEST_BLOCKS, block_sums, blocks
 from crazyem.physics.rotors import thrust_from_command, thrust_from_speed
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.finding import Finding, Grade
-from crazyem.recordings.recording import Recording
+from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.thrust import carried, vehicle_for, weight_objection
 from crazyem.vehicle import Vehicle, load_vehicle, preset_names
 
@@ -27,20 +27,13 @@ FEWEST_BLOCK_ROWS = 25  # fewest rows of a block (0.25 s)
 
 @dataclass(frozen=True, slots=True)
 class Carried:
-    """Mass that a flight shows by a thrust law.
+    """Mass that a flight shows by a thrust law."""
 
-    Attributes:
-        mass: kg, mean thrust over mean specific force along body z.
-        low, high: 95 % interval, without the error of the thrust law.
-        sag: relative change of this mass per volt of battery [1/V]; NaN if the voltage hardly changes.
-        seconds: of flight used.
-    """
-
-    mass: float
-    low: float
+    mass: float  # kg, mean thrust over mean specific force along body z
+    low: float  # kg, 95 % interval, without the error of the thrust law
     high: float
-    sag: float
-    seconds: float
+    sag: float  # 1/V, relative change of this mass per volt of battery; NaN if the voltage hardly changes
+    seconds: float  # of flight used
 
 
 def check(recording: Recording) -> list[Finding]:
@@ -62,11 +55,9 @@ def check(recording: Recording) -> list[Finding]:
         evidence |= {f"mass_{key}_kg": one.mass, f"mass_{key}_low_kg": one.low, f"mass_{key}_high_kg": one.high}
         evidence |= {f"sag_{key}_per_V": one.sag, "seconds": one.seconds}
     listed = ", ".join(f"{1e3 * one.mass:.1f} g by {name}" for name, one in by_law.items())
+    bound = "at least" if ratio > 1.0 else "at most"
     text = (
-        f"{1e3 * claim:.1f} g are claimed, but the rotors carry {listed} (thrust laws of known drones): at least "
-        f"{ratio:.2f} times the claim. Only the ratio of thrust scale to mass can be observed."
-        if ratio > 1.0
-        else f"{1e3 * claim:.1f} g are claimed, but the rotors carry {listed} (thrust laws of known drones): at most "
+        f"{1e3 * claim:.1f} g are claimed, but the rotors carry {listed} (thrust laws of known drones): {bound} "
         f"{ratio:.2f} times the claim. Only the ratio of thrust scale to mass can be observed."
     )
     advice = "Weigh the drone as it flew, or give the vehicle a thrust law of its own."
@@ -103,10 +94,11 @@ def apparent_mass(recording: Recording, vehicle: Vehicle) -> Carried | None:
     if made is None:
         return None
     grid, thrust, volts = made
-    force = next(iter(measurements(recording, "specific_force").values()), None)
-    carried = track(force, grid, bridge=THRUST_BRIDGED_SECONDS) if force is not None else None
-    lift = carried.value[:, 2] if carried is not None else np.full(grid.size, GRAVITY)
-    valid = thrust.valid & (carried.valid if carried is not None else True)
+    lift, valid = np.full(grid.size, GRAVITY), thrust.valid
+    force = _first(recording, "specific_force")
+    if force is not None:
+        felt = track(force, grid, bridge=THRUST_BRIDGED_SECONDS)
+        lift, valid = felt.value[:, 2], valid & felt.valid
     total = thrust.value[:, 0]
     turning = valid & (total > 1e-3)
     if turning.sum() < FEWEST_BLOCKS * FEWEST_BLOCK_ROWS:
@@ -129,22 +121,23 @@ def apparent_mass(recording: Recording, vehicle: Vehicle) -> Carried | None:
 
 def _thrust(recording: Recording, vehicle: Vehicle) -> tuple[Grid, Track, Track] | None:
     """Total thrust (m, 1) [N] and voltage (m, 1) on a grid, from rotor speeds if possible, else from the duty."""
-    speed = next(iter(measurements(recording, "rotor_speed").values()), None)
-    voltage = next(iter(measurements(recording, "voltage").values()), None)
+    speed, voltage = _first(recording, "rotor_speed"), _first(recording, "voltage")
     if speed is not None and vehicle.rotor_constant is not None:
         grid = grid_of(speed)
         rotor = track(speed, grid, bridge=THRUST_BRIDGED_SECONDS)
         force = thrust_from_speed(rotor.value, rotor_constant=vehicle.rotor_constant).sum(axis=1)
-        volts = (
-            track(voltage, grid, bridge=2.0) if voltage is not None else Track(np.zeros((grid.size, 1)), rotor.valid)
-        )
+        unknown = Track(np.zeros((grid.size, 1)), rotor.valid)
+        volts = unknown if voltage is None else track(voltage, grid, bridge=2.0)
         return grid, Track(force[:, None], rotor.valid), volts
-    command = next(iter(measurements(recording, "motor_command").values()), None)
+    command = _first(recording, "motor_command")
     if command is None or voltage is None or not vehicle.thrust_curve:
         return None
     grid = grid_of(command, voltage)
     duty, volts = track(command, grid, bridge=THRUST_BRIDGED_SECONDS), track(voltage, grid, bridge=2.0)
-    force = thrust_from_command(
-        np.clip(duty.value, 0.0, 1.0), volts.value[:, 0], thrust_curve=vehicle.thrust_curve
-    ).sum(axis=1)
+    ratio = np.clip(duty.value, 0.0, 1.0)
+    force = thrust_from_command(ratio, volts.value[:, 0], thrust_curve=vehicle.thrust_curve).sum(axis=1)
     return grid, Track(force[:, None], duty.valid & volts.valid), volts
+
+
+def _first(recording: Recording, quantity: str) -> SignalArray | None:
+    return next(iter(measurements(recording, quantity).values()), None)
