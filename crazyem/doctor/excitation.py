@@ -110,6 +110,16 @@ def predictor_of(inputs: Inputs, steps: Steps) -> Array:
     return fit_predictor(inputs.wrench[np.concatenate([_indices(inputs, nodes) for nodes in steps.nodes])])
 
 
+def delay_sd(inputs: Inputs) -> float:
+    """Standard deviation [s] of the prior of the delay."""
+    return DELAY_SD if inputs.lagged else SPEED_DELAY_SD
+
+
+def offset_sd(vehicle: Vehicle) -> float:
+    """Standard deviation [N m] of the prior of the torque offsets."""
+    return max(TRIM_SD * vehicle.mass * GRAVITY * max(vehicle.arm), 1e-9)
+
+
 def rotation_fit(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | None:
     """`rotation_fit_once`, widened by the scatter of quarters of the flight.
 
@@ -146,12 +156,11 @@ def rotation_fit_once(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | N
     Returns: None with too few steps.
     """
     nominal = np.array(vehicle.inertia)
-    unit = max(TRIM_SD * vehicle.mass * GRAVITY * max(vehicle.arm), 1e-9)
-    delay_sd = (DELAY_SD if inputs.lagged else SPEED_DELAY_SD) * 1e3
+    unit = offset_sd(vehicle)
     timed = inputs.lagged
     centre = np.array([*np.log(nominal), math.log(max(vehicle.motor_time_constant, 1e-4)), 0.0, 0.0, 0.0, 0.0])
     centre[4] = DELAY * 1e3 if timed else 0.0
-    prior = np.array([INERTIA_SD] * 3 + [LAG_SD if timed else 0.1, delay_sd, unit, unit, unit]) ** -2.0
+    prior = np.array([INERTIA_SD] * 3 + [LAG_SD if timed else 0.1, 1e3 * delay_sd(inputs), unit, unit, unit]) ** -2.0
     theta = centre.copy()
     response = [_angular_acceleration(t, w, nominal) for t, w in zip(steps.nodes, steps.values)]
     predictor = predictor_of(inputs, steps)

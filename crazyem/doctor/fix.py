@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor import CHECKS
+from crazyem.doctor import CHECKS, Check
 from crazyem.doctor.kinematics import continuous
 from crazyem.doctor.streams import runs as runs_of
 from crazyem.physics.rotations import rotation_matrix
@@ -48,7 +48,7 @@ def apply_fixes(recording: Recording, findings: Iterable[Finding]) -> tuple[Reco
         if current is None or not _possible(recording, current.fix):
             continue
         repaired = repair(recording, current)
-        if _checkable(finding) and _again(repaired, finding) is not None:
+        if _check_of(finding) is not None and _again(repaired, finding) is not None:
             continue
         recording = repaired
         applied.append(finding)
@@ -61,7 +61,7 @@ def apply_fixes(recording: Recording, findings: Iterable[Finding]) -> tuple[Reco
 def _rank(finding: Finding) -> int:
     """Rank of a repair in the order of application: repairs of readers first, while their row numbers still hold."""
     assert finding.fix is not None
-    return FIX_ORDER.index(finding.fix.kind) if _checkable(finding) else -1
+    return -1 if _check_of(finding) is None else FIX_ORDER.index(finding.fix.kind)
 
 
 def repair(recording: Recording, finding: Finding) -> Recording:
@@ -78,22 +78,23 @@ def repair(recording: Recording, finding: Finding) -> Recording:
 
 def _again(recording: Recording, finding: Finding) -> Finding | None:
     """The finding by a new run of its check: None if it is gone, the finding itself if no check can run again."""
-    if not _checkable(finding):
+    check = _check_of(finding)
+    if check is None:
         return finding
-    check = next(c for c in CHECKS if c.module == finding.check)
     return next((f for f in check.run(recording) if _same(f, finding)), None)
 
 
-def _checkable(finding: Finding) -> bool:
-    return any(check.module == finding.check for check in CHECKS)
+def _check_of(finding: Finding) -> Check | None:
+    return next((check for check in CHECKS if check.module == finding.check), None)
 
 
 def _same(one: Finding, other: Finding) -> bool:
     """Whether two findings ask for a repair of one kind of the same signals."""
     a, b = one.fix, other.fix
-    if a is None or b is None or one.check != other.check or one.signal != other.signal:
+    if a is None or b is None:
         return False
-    return a.kind == b.kind and set(a.signals) == set(b.signals)
+    alike = (one.check, one.signal, a.kind) == (other.check, other.signal, b.kind)
+    return alike and set(a.signals) == set(b.signals)
 
 
 def _possible(recording: Recording, fix: Fix | None) -> bool:

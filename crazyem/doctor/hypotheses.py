@@ -27,33 +27,19 @@ LEAST_SCALE_COVERAGE = 0.5  # least share of the time that the data of a scale f
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Result of the comparison of one measurement with its predictions.
+    """Result of the comparison of one measurement with its predictions."""
 
-    Attributes:
-        against: name of the signal that the predictions come from.
-        choice: which hypothesis holds.
-        lag: s by which the measurement is late; already removed.
-        whole: slope of the measurement against the chosen prediction, all components together.
-        single: the same for each component.
-        offset: (3,) median of measurement minus slope times prediction.
-        offset_error: (3,) its standard error.
-        covered: share of the common time that the windows of the slope cover.
-        mean: (3,) of the measurement.
-        predicted: (3,) mean of the declared prediction.
-        mean_error: (3,) standard error of `mean`, without the part that the prediction explains.
-    """
-
-    against: str
-    choice: Choice
-    lag: float
-    whole: Slope | None
-    single: tuple[Slope | None, ...]
-    offset: Array
-    offset_error: Array
-    covered: float
-    mean: Array
-    predicted: Array
-    mean_error: Array
+    against: str  # name of the signal that the predictions come from
+    choice: Choice  # which hypothesis holds
+    lag: float  # s by which the measurement is late; already removed
+    whole: Slope | None  # slope of the measurement against the chosen prediction, all components together
+    single: tuple[Slope | None, ...]  # the same for each component
+    offset: Array  # (3,) median of measurement minus slope times prediction
+    offset_error: Array  # (3,) its standard error
+    covered: float  # share of the common time that the windows of the slope cover
+    mean: Array  # (3,) of the measurement
+    predicted: Array  # (3,) mean of the declared prediction
+    mean_error: Array  # (3,) standard error of `mean`, without the part that the prediction explains
 
     @property
     def declared(self) -> str:
@@ -76,14 +62,6 @@ class Comparison:
             out |= {"slope": self.whole.value, "slope_low": self.whole.low, "slope_high": self.whole.high}
             out["samples"] = float(self.whole.samples)
         return out
-
-
-def _aligned(array: SignalArray, grid: Grid, declared: Track, window: Window) -> tuple[Track, float]:
-    """A measurement on the grid without its lag behind a smoothed prediction, and this lag [s]; 0 if unknown."""
-    raw = track(array, grid)
-    late = delay(declared, window.mean(raw))
-    lag = 0.0 if late is None or late.at_edge or late.explained < 0.3 else late.value
-    return (track(array, grid, shift=lag) if lag else raw), lag
 
 
 def compare_hypotheses(
@@ -111,7 +89,10 @@ def compare_hypotheses(
     stride = max(ROW_STRIDE, grid.size // MOST_COMPARED_ROWS)
     smooth = {name: window.mean(given) for name, (_, given) in candidates.items()}
     declared = next(iter(smooth.values()))
-    raw, lag = _aligned(array, grid, declared, window)
+    raw = track(array, grid)
+    late = delay(declared, window.mean(raw))
+    lag = 0.0 if late is None or late.at_edge or late.explained < 0.3 else late.value
+    raw = track(array, grid, shift=lag) if lag else raw
     measured = window.mean(raw)
     rows = np.flatnonzero(measured.valid & np.logical_and.reduce([s.valid for s in smooth.values()]))[::stride]
     if rows.size < 100 or float(declared.value[rows].std(axis=0).max()) < least:

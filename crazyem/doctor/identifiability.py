@@ -267,20 +267,19 @@ def _lag(fit: Fit, inputs: Inputs, steps: Steps, *, believed: bool, doubtful: bo
 
 
 def _delay(fit: Fit, inputs: Inputs, believed: bool) -> Verdict:
-    prior = (excitation.DELAY_SD if inputs.lagged else excitation.SPEED_DELAY_SD) * 1e3
+    prior = 1e3 * excitation.delay_sd(inputs)
     own = fit.total(4)
     together = own / math.hypot(1.0, own / prior)
     if not believed:
         return Verdict(INPUT_DELAY.name, "no", "the logged commands do not explain the rotation", unit="s")
     verdict = "yes" if together < 0.7 * prior else "weak" if together < 0.9 * prior else "no"
-    reason = (
-        "from the phase of rotation behind torque" if verdict == "yes" else "the data say no more than the prior does"
-    )
+    phase, prior_only = "from the phase of rotation behind torque", "the data say no more than the prior does"
+    reason = phase if verdict == "yes" else prior_only
     return Verdict(INPUT_DELAY.name, verdict, reason, sd=own * 1e-3, value=float(fit.value[4]) * 1e-3, unit="s")
 
 
 def _offsets(fit: Fit, vehicle: Vehicle) -> Verdict:
-    unit = max(excitation.TRIM_SD * vehicle.mass * GRAVITY * max(vehicle.arm), 1e-9)
+    unit = excitation.offset_sd(vehicle)
     worst = max(fit.total(i) for i in (5, 6, 7))
     verdict = "yes" if worst < 0.7 * unit else "weak" if worst < unit else "no"
     reason = "from the mean torque in flight, the worst of three axes"

@@ -30,24 +30,18 @@ LOG_LIKELIHOOD_RATIO = 10.0  # nats; least log likelihood ratio between the best
 class Slope:
     """The factor s of y = s x + offset, all components together.
 
-    Attributes:
-        value: geometric mean of two regressions: of y on x (noise of x makes it too small), and 1 / (that of x on y)
-            (noise of y makes it too large). The true slope lies between the two if the noises are independent.
-        low, high: 95 % interval: from the lower to the higher regression, each widened by its jackknife error.
-        far_low, far_high: the same at the level `SLOPE_CONFIDENCE`.
-        explained: squared correlation.
-        samples: number of samples (rows times components).
-        blocks: effective number of blocks, weighted by the motion in each.
+    Noise of x makes the regression of y on x too small, noise of y makes 1 / (regression of x on y) too large. The true
+    slope lies between the two if the noises are independent.
     """
 
-    value: float
-    low: float
+    value: float  # geometric mean of the two regressions
+    low: float  # 95 % interval: from the lower to the higher regression, each widened by its jackknife error
     high: float
-    far_low: float
+    far_low: float  # the same at the level `SLOPE_CONFIDENCE`
     far_high: float
-    explained: float
-    samples: int
-    blocks: float
+    explained: float  # squared correlation
+    samples: int  # rows times components
+    blocks: float  # effective number of blocks, weighted by the motion in each
 
 
 def blocks(time: Array) -> NDArray[np.int64]:
@@ -138,21 +132,13 @@ def _middle(both: tuple[float, float]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Which hypothesis a measurement supports.
+    """Which hypothesis a measurement supports."""
 
-    Attributes:
-        name: the simplest hypothesis that is not beaten with certainty; "" if several are equally simple.
-        best: the hypothesis with the least unexplained variance.
-        explained: share of the variance that each hypothesis explains.
-        ratio: unexplained variance of the declared hypothesis over that of the best.
-        denied: the declared hypothesis is beaten with certainty.
-    """
-
-    name: str
-    best: str
-    explained: Mapping[str, float]
-    ratio: float
-    denied: bool
+    name: str  # the simplest hypothesis that is not beaten with certainty; "" if several are equally simple
+    best: str  # the hypothesis with the least unexplained variance
+    explained: Mapping[str, float]  # share of the variance that each hypothesis explains, the declared one first
+    ratio: float  # unexplained variance of the declared hypothesis over that of the best
+    denied: bool  # the declared hypothesis is beaten with certainty
 
 
 def choose(

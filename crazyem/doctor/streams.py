@@ -23,17 +23,11 @@ COMMAND_SIGNALS = frozenset({
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
-    """Signals that were sampled together.
+    """Signals that were sampled together."""
 
-    Attributes:
-        name: to display: the name of the log block, table or topic, else the names of its signals.
-        names: of its signals.
-        arrays: of its signals, one time axis.
-    """
-
-    name: str
-    names: tuple[str, ...]
-    arrays: tuple[SignalArray, ...]
+    name: str  # to display: the name of the log block, table or topic, else the names of its signals
+    names: tuple[str, ...]  # of its signals
+    arrays: tuple[SignalArray, ...]  # of its signals, one time axis
 
     @property
     def time(self) -> NDArray[np.float64]:
@@ -99,17 +93,11 @@ def listed(names: Sequence[str], most: int = 4) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Cadence:
-    """Period and jitter of a stream.
+    """Period and jitter of a stream."""
 
-    Attributes:
-        period: s between samples if none is lost; NaN with fewer than eight samples.
-        jitter: s, median deviation of an interval from the period.
-        regular: True if the stream keeps the period, apart from losses; False for events.
-    """
-
-    period: float
-    jitter: float
-    regular: bool
+    period: float  # s between samples if none is lost; NaN with fewer than eight samples
+    jitter: float  # s, median deviation of an interval from the period
+    regular: bool  # True if the stream keeps the period, apart from losses; False for events
 
 
 def cadence(time: NDArray[np.float64]) -> Cadence:
