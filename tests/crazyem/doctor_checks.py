@@ -1,11 +1,15 @@
 """What the tests of the stream checks share: running one check or all, and planting values into a recording."""
 
+from dataclasses import replace
+
+import numpy as np
 from made_flight import changed
 
 from crazyem.doctor import CHECKS as CHECKS_OF_DOCTOR
 from crazyem.recordings.finding import Finding
 from crazyem.recordings.recording import Recording
 
+IMU = ("body_rate", "specific_force")  # the signals of the stream "imu" of a made flight
 CHECKS = ("numbers", "gaps", "interpolated", "repeated", "clocks", "frozen", "saturation", "rotor_sensor", "flight")
 
 
@@ -28,7 +32,21 @@ def covers(finding: Finding, start: float, end: float, slack: float = 0.02) -> b
     return any(a - slack <= start and end <= b + slack for a, b in finding.intervals)
 
 
-def with_values(recording: Recording, name: str, rows: slice, value: object) -> Recording:
+def rows_of(finding: Finding) -> list[int]:
+    """The samples that the repair of a finding changes."""
+    assert finding.fix is not None
+    assert finding.fix.rows is not None
+    return finding.fix.rows.tolist()
+
+
+def with_values(recording: Recording, name: str, place: object, value: object) -> Recording:
+    """The recording with other values at a place: rows, or rows and columns."""
     values = recording.signals[name].value.copy()
-    values[rows] = value
+    values[place] = value  # type: ignore[index]
     return changed(recording, name, value=values)
+
+
+def with_fields(recording: Recording, *names: str, **fields: np.ndarray) -> Recording:
+    """The recording with other arrays (`time`, `host_time`, `marked`) of some signals."""
+    arrays = {name: replace(recording.signals[name], **fields) for name in names}
+    return replace(recording, signals={**recording.signals, **arrays})

@@ -93,12 +93,10 @@ def test_crazypad_without_its_pwm_is_told_by_the_mixers_grid(shared_recordings):
 
 
 def test_real_firmware_logged_pwm(shared_recordings):
-    columns = {name: [] for name in MOTOR_VARIABLES}
     with gzip.open(shared_recordings / "real_firmware" / "lee_brushless_39g.csv.gz", "rt") as file:
-        for row in csv.DictReader(file):
-            if row["name"] in columns:
-                columns[row["name"]].append(float(row["value"]))
-    assert decide([table({k: np.array(v) for k, v in columns.items()})]).meaning == "duty"
+        rows = list(csv.DictReader(file))
+    values = [np.array([float(row["value"]) for row in rows if row["name"] == name]) for name in MOTOR_VARIABLES]
+    assert decide([table(motors(values))]).meaning == "duty"
 
 
 # --- each kind of evidence ---
@@ -142,9 +140,7 @@ def test_versions(version, meaning):
     assert decide([table(motors(FLAT))], metadata={"crazyem": {"cflib": version}}).meaning is None
 
 
-def test_the_mixers_arithmetic():
-    assert decide([table(motors(REQUEST))]).meaning == "request"
-    assert decide([table(motors(DUTY))]).meaning == "duty"
+def test_the_mixers_arithmetic_with_its_inputs():
     with_commands = decide([table(motors(REQUEST) | CONTROLLER)])
     assert with_commands.meaning == "request"
     assert with_commands.evidence["mixer_equal_share"] > 0.99
@@ -196,12 +192,10 @@ def test_contradictions_are_left_open(values, ctypes, extra):
 
 
 def test_the_user_fills_in_and_is_warned():
-    told = decide([table(motors(FLAT))], given="request")
-    assert (told.meaning, told.findings[0].grade) == ("request", Grade.HARMLESS)
-    told = decide([table(motors(DUTY))], given="duty")
-    assert (told.meaning, told.findings[0].grade) == ("duty", Grade.HARMLESS)
-    told = decide([table(motors(DUTY))], given="request")
-    assert (told.meaning, told.findings[0].grade) == ("request", Grade.DEGRADES)
+    cases = ((FLAT, "request", Grade.HARMLESS), (DUTY, "duty", Grade.HARMLESS), (DUTY, "request", Grade.DEGRADES))
+    for values, word, grade in cases:
+        told = decide([table(motors(values))], given=word)
+        assert (told.meaning, told.findings[0].grade) == (word, grade)
     assert "as told" in told.findings[0].text
     with pytest.raises(UsageError, match="duty"):
         decide([table(motors(DUTY))], given="pwm")
