@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from crazyem.doctor import kinematics, regression
 from crazyem.doctor.delays import delay, spread
 from crazyem.doctor.kinematics import Grid, Track, Window
-from crazyem.physics.rotations import euler_from_quaternion, quaternion_from_euler, rotate
+from crazyem.physics.rotations import euler_from_quaternion, rotate
 
 
 def test_a_track_follows_a_smooth_signal_and_stops_at_gaps() -> None:
@@ -45,10 +45,7 @@ def test_rotations_agree_with_scipy(seed: int) -> None:
     q = turn.as_quat()
     assert np.allclose(rotate(q, vector), turn.apply(vector))
     assert np.allclose(rotate(q, vector, inverse=True), turn.inv().apply(vector))
-    euler = euler_from_quaternion(q)
-    assert np.allclose(euler, turn.as_euler("ZYX")[:, ::-1])
-    again = quaternion_from_euler(*euler.T)
-    assert np.allclose(np.abs((again * q).sum(axis=1)), 1.0)
+    assert np.allclose(euler_from_quaternion(q), turn.as_euler("ZYX")[:, ::-1])
 
 
 def test_the_rate_of_an_attitude_is_the_rate_it_turns_with() -> None:
@@ -65,8 +62,8 @@ def test_smoothing_both_sides_keeps_a_derivative_a_derivative() -> None:
     grid = Grid(0.0, 1000)
     x = np.column_stack([np.sin(5 * grid.time), grid.time])
     y = np.column_stack([5 * np.cos(5 * grid.time), np.ones(1000)])
-    window = Window(0.2)
-    left, right = window.rate(Track(x, np.ones(1000, bool))), window.mean(Track(y, np.ones(1000, bool)))
+    window, whole = Window(0.2), np.ones(1000, bool)
+    left, right = window.mean(kinematics.difference(Track(x, whole))), window.mean(Track(y, whole))
     assert np.abs(left.value - right.value)[left.valid].max() < 5e-3
     holes = np.ones(1000, bool)
     holes[500] = False
@@ -74,7 +71,7 @@ def test_smoothing_both_sides_keeps_a_derivative_a_derivative() -> None:
 
 
 @given(factor=st.floats(0.3, 3.0), noise_x=st.floats(0.0, 0.4), noise_y=st.floats(0.0, 0.4), seed=st.integers(0, 999))
-def test_a_slope_lies_between_its_two_regressions_whatever_is_noisy(
+def test_the_interval_of_a_slope_holds_the_truth_whatever_is_noisy(
     factor: float, noise_x: float, noise_y: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -83,10 +80,9 @@ def test_a_slope_lies_between_its_two_regressions_whatever_is_noisy(
     x = truth + noise_x * rng.normal(size=truth.shape)
     y = factor * (truth + noise_y * rng.normal(size=truth.shape)) + 1.0
     got = regression.slope(x, y, regression.blocks(time))
-    assert got is not None
     assert got.far_low <= factor * 1.01
     assert got.far_high >= factor * 0.99
-    assert got.direct * (1 - 1e-9) <= got.value <= got.reverse * (1 + 1e-9)
+    assert got.low <= got.value <= got.high
 
 
 def test_a_slope_is_not_moved_by_stray_rows_nor_blind_to_rare_manoeuvres() -> None:
@@ -97,12 +93,10 @@ def test_a_slope_is_not_moved_by_stray_rows_nor_blind_to_rare_manoeuvres() -> No
     stray = rng.random(time.size) < 0.02
     y[stray] += 50.0
     got = regression.slope(x, y, regression.blocks(time))
-    assert got is not None
     assert abs(got.value - 1.3) < 0.01
     x = 0.001 * rng.normal(size=x.shape) + x * (time > 40.0)[:, None]
     y = 1.3 * x + 0.003 * rng.normal(size=x.shape)
     got = regression.slope(x, y, regression.blocks(time))
-    assert got is not None
     assert abs(got.value - 1.3) < 0.01
 
 
@@ -114,14 +108,10 @@ def test_hypotheses_that_data_do_not_separate_are_left_standing() -> None:
     y = x * np.array([1.0, -1.0, 1.0]) + 0.01 * rng.normal(size=x.shape)
     ways = {"plain": (0, x), "y": (1, x * [1, -1, 1]), "y and z": (2, x * [1, -1, -1])}
     choice = regression.choose(y, ways, block)
-    assert choice is not None
-    assert choice.denied
-    assert choice.name == "y"
+    assert (choice.denied, choice.name) == (True, "y")
     ways = {"plain": (0, x), "z": (1, x * [1, 1, -1])}
     choice = regression.choose(x + 0.3 * rng.normal(size=x.shape), ways, block)
-    assert choice is not None
-    assert not choice.denied
-    assert choice.name == "plain"
+    assert (choice.denied, choice.name) == (False, "plain")
 
 
 @given(late=st.floats(-0.2, 0.2), seed=st.integers(0, 99))
@@ -135,7 +125,6 @@ def test_a_delay_is_found_to_a_millisecond(late: float, seed: int) -> None:
     first = window.mean(Track(motion.velocity(grid.time) + 0.02 * rng.normal(size=(4000, 3)), valid))
     second = window.mean(Track(3.0 * motion.velocity(grid.time - late)[:, [1, 2, 0]], valid))
     got = delay(first, second)
-    assert got is not None
     assert abs(got.value - late) < 1e-3
     error, blocks = spread(first, Track(second.value[:, [2, 0, 1]], second.valid), got, 300)
     assert error < 2e-3
