@@ -120,7 +120,7 @@ def _twice(stream: Stream, rows: NDArray[np.int64]) -> Finding:
         alike &= ((before == after) | (np.isnan(before) & np.isnan(after))).all(axis=1)
     share = rows.size / stream.time.size
     copies = int(alike.sum())
-    values = "the same values" if copies == rows.size else f"{rows.size - copies} of them with other values"
+    values = "with the same values" if copies == rows.size else f"{rows.size - copies} of them with other values"
     text = f"{stream.name}: {rows.size} records ({percent(share)}) carry the stamp of the record before, {values}."
     spans = longest(zip(stream.time[rows], stream.time[rows]))
     evidence = {"records": int(rows.size), "share": share, "copies": copies}
