@@ -1,23 +1,126 @@
 """Layouts for Foxglove and Lichtblick that show a flight: pose, parameters, residuals, link, motors, voltage.
 
-`flight_layout.json` is the layout for one drone and its recording, in the exchange format of the viewers. The layout
-for several live drones is made of the same panels, with /NAME before their topics (live/foxglove.py).
+The layout for one drone and its recording, in the exchange format of the viewers. The layout for several live drones is
+made of the same panels, with /NAME before their topics (live/foxglove.py).
 """
 
-import json
 from collections.abc import Sequence
-from importlib import resources
 from typing import Any
 
 _COLOURS = ("#4e98e2", "#f5774d", "#6ac27c", "#b678d9", "#e2c84e", "#4ed0d0", "#e27fb4", "#9a9a9a")  # one per drone
+_GREY = "#888888"
+_SCENE: dict[str, Any] = {
+    "foxglovePanelTitle": "pose",
+    "followTf": "world",
+    "followMode": "follow-none",
+    "cameraState": {
+        "perspective": True,
+        "distance": 3,
+        "phi": 60,
+        "thetaOffset": 45,
+        "targetOffset": [0, 0, 0.5],
+        "target": [0, 0, 0],
+        "targetOrientation": [0, 0, 0, 1],
+        "fovy": 45,
+        "near": 0.01,
+        "far": 500,
+    },
+    "scene": {"transforms": {"axisScale": 0.3, "labelSize": 0.05}},
+    "transforms": {"frame:world": {"visible": True}, "frame:crazyflie": {"visible": True}},
+    "topics": {"/pose": {"visible": True, "type": "axis", "axisScale": 0.2}},
+    "layers": {"grid": {"layerId": "foxglove.Grid", "visible": True, "frameId": "world", "size": 10, "divisions": 10}},
+    "publish": {},
+    "imageMode": {},
+}
 
 
 def foxglove_layout() -> dict[str, Any]:
     """The layout of a flight recorded by `crazyem fly` or `crazyem watch`, ready for JSON."""
-    text = (resources.files("crazyem.recordings.mcap") / "flight_layout.json").read_text(encoding="utf-8")
-    layout = json.loads(text)
-    assert isinstance(layout, dict)
-    return layout
+    inertia = [
+        path for name, colour in zip(("Ixx", "Iyy", "Izz"), _COLOURS, strict=False) for path in _estimate(name, colour)
+    ]
+    panels = {
+        "3D!pose": dict(_SCENE),
+        "Plot!mass": _plot("mass [kg], 95 % interval", _estimate("mass", _COLOURS[0])),
+        "Plot!inertia": {
+            "minYValue": 0,
+            "maxYValue": 6e-05,
+            **_plot("inertia [kg m^2], 95 % intervals", inertia),
+        },
+        "Plot!lag": _plot("motor time constant [s], 95 % interval", _estimate("motor_time_constant", _COLOURS[3])),
+        "Plot!position_residual": _residual("position residual [m]", "position"),
+        "Plot!attitude_residual": _residual("attitude residual [rad]", "attitude"),
+        "Plot!rate_residual": _residual("body rate residual [rad/s]", "body_rate"),
+        "Plot!link": _plot(
+            "link: packets a second, late, lost",
+            _paths({"/link.rate": "packets a second", "/link.lost": "lost", "/link.late": "late"}),
+        ),
+        "Plot!latency": _plot("link: delay over the promptest packets [s]", _paths({"/link.latency": "delay"})),
+        "Plot!motors": _plot("motor commands", _paths({f"/log/1.motor_m{n}": f"m{n}" for n in range(1, 5)})),
+        "Plot!voltage": _plot("battery voltage", _paths({"/log/1.pm_vbatMV": "voltage"})),
+        "RawMessages!estimate": {"topicPath": "/estimate", "diffEnabled": False, "expansion": "all"},
+        "RosOut!log": {"topicToRender": "/events", "searchTerms": [], "minLogLevel": 1},
+    }
+    estimate = _columns(_columns("Plot!mass", "Plot!inertia"), "Plot!lag")
+    residuals = _columns(_columns("Plot!position_residual", "Plot!attitude_residual"), "Plot!rate_residual")
+    link = _columns(_columns("Plot!link", "Plot!latency"), _columns("Plot!motors", "Plot!voltage"))
+    tabs = {"Estimate": estimate, "Residuals": residuals, "Link and power": link, "Messages": "RawMessages!estimate"}
+    panels["Tab!right"] = {"activeTabIdx": 0, "tabs": [_tab(title, layout) for title, layout in tabs.items()]}
+    left = {**_columns("3D!pose", "RosOut!log"), "splitPercentage": 70}
+    return {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": {**_rows(left, "Tab!right"), "splitPercentage": 45},
+    }
+
+
+def _path(value: str, label: str, colour: str, width: float = 1.5) -> dict[str, Any]:
+    """A line of a plot."""
+    return {
+        "value": value,
+        "label": label,
+        "enabled": True,
+        "timestampMethod": "receiveTime",
+        "color": colour,
+        "lineSize": width,
+        "showLine": True,
+    }
+
+
+def _paths(labels: dict[str, str]) -> list[dict[str, Any]]:
+    """Lines of values with these labels, in different colours."""
+    return [_path(value, label, colour) for (value, label), colour in zip(labels.items(), _COLOURS, strict=False)]
+
+
+def _estimate(name: str, colour: str) -> list[dict[str, Any]]:
+    """The estimate of a parameter and its 95 % interval."""
+    value = f'/estimate.parameters[:]{{name=="{name}"}}'
+    ends = [_path(f"{value}.ci95_{end}", f"{name}, {end}", colour, 0.75) for end in ("low", "high")]
+    return [_path(f"{value}.value", name, colour), *ends]
+
+
+def _residual(title: str, name: str) -> dict[str, Any]:
+    """The plot of a residual and its expected standard deviation."""
+    lines = _paths({f"/residual.{name}_{axis}": axis for axis in "xyz"})
+    return _plot(title, [*lines, _path(f"/residual.{name}_x_sd", "expected sd of x", _GREY)])
+
+
+def _plot(title: str, paths: list[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        "foxglovePanelTitle": title,
+        "title": title,
+        "paths": paths,
+        "showXAxisLabels": True,
+        "showYAxisLabels": True,
+        "showLegend": True,
+        "legendDisplay": "left",
+        "showPlotValuesInLegend": False,
+        "isSynced": True,
+        "xAxisVal": "timestamp",
+        "sidebarDimension": 170,
+    }
 
 
 def swarm_layout(names: Sequence[str]) -> dict[str, Any]:
