@@ -39,7 +39,7 @@ def foxglove_layout() -> dict[str, Any]:
     inertia = [
         path for name, colour in zip(("Ixx", "Iyy", "Izz"), _COLOURS, strict=False) for path in _estimate(name, colour)
     ]
-    panels = {
+    panels: dict[str, Any] = {
         "3D!pose": dict(_SCENE),
         "Plot!mass": _plot("mass [kg], 95 % interval", _estimate("mass", _COLOURS[0])),
         "Plot!inertia": {
@@ -192,7 +192,7 @@ def _side_by_side(own: dict[str, str]) -> dict[str, Any]:
     return _rows(_rows(left, middle), _rows(right, own["RawMessages!estimate"]))
 
 
-def _tab(title: str, layout: dict[str, Any]) -> dict[str, Any]:
+def _tab(title: str, layout: Any) -> dict[str, Any]:
     return {"title": title, "layout": layout}
 
 

@@ -1,30 +1,111 @@
 """The protobuf messages of MCAP files, without generated code; every viewer can decode them.
 
 Log packets have one message type per block and one field per variable. `struct` packs and unpacks them: all fields have
-8 bytes, so a message has a fixed length and takes about a microsecond. All other messages are defined in
-messages.textproto and use google.protobuf.
+8 bytes, so a message has a fixed length and takes about a microsecond. All other messages stand in the table
+`_MESSAGES` and use google.protobuf.
 """
 
 import functools
 import json
 import struct
 from collections.abc import Iterable
-from importlib import resources
 from typing import Any
 
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, text_format
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from crazyem.signals.sample import Block, Packet, Variable
 
 _F = descriptor_pb2.FieldDescriptorProto
-_TYPES = {"double": _F.TYPE_DOUBLE, "sfixed64": _F.TYPE_SFIXED64, "fixed64": _F.TYPE_FIXED64}  # of 8 bytes
+
+
+def axes(*quantities: str) -> str:
+    """Names of three fields for each quantity: "position_x position_y position_z"."""
+    return " ".join(f"{quantity}_{axis}" for quantity in quantities for axis in "xyz")
+
+
+RESIDUALS = axes("position", "velocity", "attitude", "body_rate")
+_TIMESTAMP, _POSE = "google/protobuf/timestamp.proto", "foxglove/Pose.proto"
+# file -> message -> types and names of its fields, numbered from 1; the numbers are part of the file format
+# (docs/reference/formats/mcap.md)
+_MESSAGES: dict[str, dict[str, str]] = {
+    _TIMESTAMP: {"Timestamp": "int64 seconds, int32 nanos"},
+    "crazyem.proto": {
+        "Setpoint": f"double time host_time {axes('position', 'velocity', 'acceleration')} yaw yaw_rate",
+        "ParameterWrite": "double host_time, string name, double value echoed, bool verified",
+        "ParameterEstimate": "string name, double value sd ci95_low ci95_high, string unit, bool identifiable, "
+        "string reason",
+        "Estimate": "double time host_time, crazyem.ParameterEstimate[] parameters, int64 samples updates, "
+        "bool converged",
+        # the drone's packets so far, and over the last second
+        "Link": "double host_time, int64 received lost late, double rate loss latency, "
+        "double round_trip clock_offset clock_rate, int64 outages",
+        # measured minus predicted in the newest sample, and the expected standard deviation
+        "Residual": f"double time host_time {RESIDUALS} {RESIDUALS.replace(' ', '_sd ')}_sd",
+        # any event without a message of its own
+        "Event": "double time, string kind json",
+    },
+    _POSE: {
+        "Vector3": "double x y z",
+        "Quaternion": "double x y z w",
+        "Pose": "foxglove.Vector3 position, foxglove.Quaternion orientation",
+    },
+    "foxglove/Log.proto": {
+        "Log": "google.protobuf.Timestamp timestamp, foxglove.Log.Level level, string message name",
+    },
+    "foxglove/PoseInFrame.proto": {
+        "PoseInFrame": "google.protobuf.Timestamp timestamp, string frame_id, foxglove.Pose pose",
+    },
+    "foxglove/FrameTransform.proto": {
+        "FrameTransform": "google.protobuf.Timestamp timestamp, string parent_frame_id child_frame_id, "
+        "foxglove.Vector3 translation, foxglove.Quaternion rotation",
+    },
+}
+_DEPENDENCIES = {
+    "foxglove/Log.proto": [_TIMESTAMP],
+    "foxglove/PoseInFrame.proto": [_TIMESTAMP, _POSE],
+    "foxglove/FrameTransform.proto": [_TIMESTAMP, _POSE],
+}
+_LOG_LEVELS = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
+
+
+def _message(name: str, fields: Iterable[tuple[str, str]]) -> descriptor_pb2.DescriptorProto:
+    """The descriptor of a message from (type, name) of its fields."""
+    message = descriptor_pb2.DescriptorProto(name=name)
+    for number, (kind, field) in enumerate(fields, start=1):
+        added = message.field.add(name=field, number=number, label=_F.LABEL_OPTIONAL)
+        if kind.endswith("[]"):
+            added.label = _F.LABEL_REPEATED
+        if "." in kind:
+            added.type = _F.TYPE_ENUM if kind == "foxglove.Log.Level" else _F.TYPE_MESSAGE
+            added.type_name = "." + kind.removesuffix("[]")
+        else:
+            added.type = _F.Type.Value(f"TYPE_{kind.upper()}")
+    return message
+
+
+def _fields(text: str) -> list[tuple[str, str]]:
+    """(type, name) of each field of "double x y, bool flag"."""
+    return [(kind, name) for kind, *names in map(str.split, text.split(",")) for name in names]
+
+
+def _file(name: str, package: str, messages: Iterable[Any]) -> Any:
+    return descriptor_pb2.FileDescriptorProto(name=name, package=package, syntax="proto3", message_type=messages)
 
 
 @functools.cache
 def _files() -> tuple[Any, ...]:
     """Descriptors of all fixed files, dependencies first."""
-    text = (resources.files("crazyem.recordings.mcap") / "messages.textproto").read_text(encoding="utf-8")
-    return tuple(text_format.Parse(text, descriptor_pb2.FileDescriptorSet()).file)
+    files = []
+    for name, messages in _MESSAGES.items():
+        package = name.removesuffix(".proto").rpartition("/")[0].replace("/", ".") or "crazyem"
+        file = _file(name, package, [_message(m, _fields(text)) for m, text in messages.items()])
+        file.dependency.extend(_DEPENDENCIES.get(name, ()))
+        if name == "foxglove/Log.proto":
+            enum = file.message_type[0].enum_type.add(name="Level")
+            for number, level in enumerate(_LOG_LEVELS):
+                enum.value.add(name=level, number=number)
+        files.append(file)
+    return tuple(files)
 
 
 @functools.cache
@@ -39,47 +120,29 @@ def message_class(name: str) -> Any:
 @functools.cache
 def schema_data(name: str) -> bytes:
     """The serialised FileDescriptorSet of a message, dependencies included, as MCAP requires."""
-    by_name = {file.name: file for file in _files()}
-    wanted: list[Any] = []
-
-    def add(file: Any) -> None:
-        for need in file.dependency:
-            add(by_name[need])
-        if file not in wanted:
-            wanted.append(file)
-
-    add(by_name[message_class(name).DESCRIPTOR.file.name])
+    own = message_class(name).DESCRIPTOR.file.name
+    wanted = [file for file in _files() if file.name in (own, *_DEPENDENCIES.get(own, ()))]
     return descriptor_pb2.FileDescriptorSet(file=wanted).SerializeToString()
 
 
 class BlockCodec:
     """Messages of one log block: `firmware_time_ms`, `host_time`, then one double per variable.
 
-    A double holds every firmware value (integers of up to 32 bits, float, half) exactly, so decoding returns the same
-    packet bit for bit. Raises ValueError if bytes are not such a message.
+    A double holds every firmware value (integers of up to 32 bits, float, half) exactly; `stream_codec` decodes.
     """
 
     def __init__(self, block: Block) -> None:
         self.block = block
         self.schema_name = f"crazyem.log.Block{block.identifier}"
-        tags = [tag(1, 1), tag(2, 1), *(tag(n, 1) for n in range(3, 3 + len(block.variables)))]
-        kinds = ["q", *("d" for _ in tags[1:])]
-        self._struct = struct.Struct("<" + "".join(f"{len(t)}s{k}" for t, k in zip(tags, kinds, strict=True)))
-        self._tags = tuple(tags)
+        self._tags = [tag(number) for number in range(1, 3 + len(block.variables))]
+        kinds = "q" + "d" * (len(self._tags) - 1)
+        self._struct = struct.Struct("<" + "".join(f"{len(t)}s{k}" for t, k in zip(self._tags, kinds, strict=True)))
 
     def encode(self, packet: Packet) -> bytes:
         fields: list[Any] = [None] * (2 * len(self._tags))
         fields[0::2] = self._tags
         fields[1::2] = (packet.firmware_time_ms, packet.host_time, *packet.values)
         return self._struct.pack(*fields)
-
-    def decode(self, data: bytes) -> Packet:
-        if len(data) != self._struct.size:
-            raise ValueError("not a message of this block")
-        fields = self._struct.unpack(data)
-        if fields[0::2] != self._tags:
-            raise ValueError("not a message of this block")
-        return Packet(self.block.identifier, fields[1], fields[3], fields[5::2])
 
     def schema_data(self) -> bytes:
         fields = [("firmware_time_ms", "sfixed64"), ("host_time", "double")]
@@ -99,20 +162,22 @@ def block_from_metadata(metadata: dict[str, str]) -> Block:
     return Block(int(metadata["identifier"]), variables, int(metadata["period_ms"]))
 
 
+def session_of(metadata: dict[str, str]) -> int:
+    """Number of the session of a log channel, from its metadata; 1 if it is absent or damaged."""
+    number = metadata.get("session", "1")
+    return int(number) if number.isdecimal() and len(number) < 6 else 1
+
+
 def dynamic_schema(package: str, name: str, fields: Iterable[tuple[str, str]]) -> bytes:
     """The serialised FileDescriptorSet of a message that is defined at run time, from (field, type) in order."""
-    message = descriptor_pb2.DescriptorProto(name=name)
-    for number, (field, kind) in enumerate(fields, start=1):
-        message.field.add(name=field, number=number, label=_F.LABEL_OPTIONAL, type=_TYPES[kind])
-    file = descriptor_pb2.FileDescriptorProto(
-        name=f"{package.replace('.', '/')}/{name}.proto", package=package, syntax="proto3", message_type=[message]
-    )
+    message = _message(name, [(kind, field) for field, kind in fields])
+    file = _file(f"{package.replace('.', '/')}/{name}.proto", package, [message])
     return bytes(descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString())
 
 
-def tag(number: int, wire_type: int) -> bytes:
-    """The tag bytes before a field."""
-    key, data = number << 3 | wire_type, bytearray()
+def tag(number: int) -> bytes:
+    """The tag bytes before a field of eight bytes."""
+    key, data = number << 3 | 1, bytearray()
     while key >= 0x80:
         data.append(key & 0x7F | 0x80)
         key >>= 7
