@@ -2,15 +2,13 @@
 
 import struct
 
+from mcap.reader import SeekingReader
+
 from crazyem.recordings.mcap.writer import RecordingWriter
 from crazyem.signals.sample import Block, Packet, Variable
 
 MAGIC = b"\x89MCAP0\r\n"
-
-
 STATE = Block(0, tuple(Variable(f"stateEstimate.{n}", "float") for n in "xyz"), 10)
-
-
 POWER = Block(1, (Variable("pm.vbat", "float"),), 10)
 
 
@@ -52,16 +50,11 @@ def chunks(data):
     return [(start, end) for start, end, opcode in top_level(data) if opcode == 6]
 
 
-def stock_messages(path):
-    """(topic, sequence, data) by the stock reader."""
-    from mcap.reader import make_reader
-
+def stock_messages(path, reader=SeekingReader):
+    """(topic, sequence, data) by a stock reader."""
     with open(path, "rb") as stream:
-        reader = make_reader(stream)
-        return [
-            (channel.topic, message.sequence, bytes(message.data))
-            for _, channel, message in reader.iter_messages(log_time_order=False)
-        ]
+        messages = list(reader(stream, validate_crcs=True).iter_messages(log_time_order=False))
+    return [(channel.topic, message.sequence, bytes(message.data)) for _, channel, message in messages]
 
 
 def chunk_record(packed, size, crc=0, compression=b"zstd"):

@@ -1,27 +1,22 @@
 """Our MCAP in the hands of others: stock readers without crazyem decode every channel, in order, after any end."""
 
 import json
-import os
-import signal
 import subprocess
 import sys
 import textwrap
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from test_mcap_signals import flight
-from test_recordings_mcap import BLOCKS, Reference
+from test_recordings_mcap import BLOCKS, record_everything
 from test_recordings_mcap import flight as packets
 
 from crazyem.errors import FileFormatError
-from crazyem.estimation.result import Estimate, ParameterEstimate
-from crazyem.links.base import LinkStatistics, ParameterWrite
 from crazyem.recordings import open_recording
 from crazyem.recordings.mcap.recover import recover
 from crazyem.recordings.mcap.signals import write_recording
-from crazyem.recordings.mcap.writer import FLUSH_PERIOD, RecordingWriter
+from crazyem.recordings.mcap.writer import FLUSH_PERIOD
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -36,20 +31,9 @@ class Blocked:
 
 sys.meta_path.insert(0, Blocked())
 from google.protobuf import descriptor_pb2, descriptor_pool
+from google.protobuf.json_format import MessageToDict
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
-
-def plain(message):
-    result = {}
-    for field in message.DESCRIPTOR.fields:
-        value = getattr(message, field.name)
-        if field.message_type is None:
-            result[field.name] = value
-        elif hasattr(value, "add"):
-            result[field.name] = [plain(item) for item in value]
-        else:
-            result[field.name] = plain(value)
-    return result
 
 topics, times, sequences = {}, [], []
 with open(sys.argv[1], "rb") as stream:
@@ -63,7 +47,8 @@ with open(sys.argv[1], "rb") as stream:
         times.append(message.log_time)
         sequences.append(message.sequence)
         entry = topics.setdefault(channel.topic, {"schema": schema.name, "messages": []})
-        entry["messages"].append(plain(decoded))
+        fields = MessageToDict(decoded, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
+        entry["messages"].append(fields)
     statistics = reader.get_summary().statistics
 print(json.dumps({"topics": topics, "times": times, "sequences": sequences, "count": statistics.message_count}))
 assert not [name for name in sys.modules if name.startswith("crazyem")]
@@ -77,23 +62,6 @@ def read_elsewhere(path, tmp_path):
     done = subprocess.run([sys.executable, "-I", str(program), str(path)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     return json.loads(done.stdout)
-
-
-def record_everything(path, *, append=False):
-    mass = ParameterEstimate(0.034, 1e-4, (0.0338, 0.0342), "kg", True)
-    with RecordingWriter(path, {"run": {"seed": "1"}}, append=append) as writer:
-        writer.blocks(BLOCKS)
-        for packet in packets(200):
-            writer.packet(packet)
-        writer.setpoint(1.25, Reference())
-        writer.parameter_write(ParameterWrite("ctrlLee.mass", 0.034, None, False, 1.7e9 + 1))
-        writer.estimate(Estimate(2.5, {"mass": mass}, samples=800, updates=7, converged=True))
-        writer.residual(2.5, np.arange(12) / 8, np.full(12, 0.5))
-        writer.link(LinkStatistics(100, 2, 1))
-        time.sleep(0.002)
-        writer.link(LinkStatistics(190, 12, 1), latency=0.003)
-        writer.event("landed", "WARNING")
-    assert writer.failure == ""
 
 
 LIVE = {
@@ -121,21 +89,11 @@ def test_a_flight_is_decoded_without_crazyem(tmp_path):
     assert topics["/residual"]["messages"][0]["velocity_z"] == 5 / 8
     assert topics["/residual"]["messages"][0]["body_rate_z_sd"] == 0.5
     health = topics["/link"]["messages"][1]
-    assert (health["received"], health["lost"], health["latency"]) == (190, 12, 0.003)
+    assert (health["received"], health["lost"], health["latency"]) == ("190", "12", 0.003)
     assert health["loss"] == pytest.approx(0.1)
     assert health["rate"] > 0
-    assert topics["/events"]["messages"][0]["level"] == 3
+    assert topics["/events"]["messages"][0]["level"] == "WARNING"
     assert topics["/tf"]["messages"][0]["parent_frame_id"] == "world"
-
-
-def test_two_sessions_are_decoded_without_crazyem(tmp_path):
-    path = tmp_path / "flight.mcap"
-    record_everything(path)
-    record_everything(path, append=True)
-    found = read_elsewhere(path, tmp_path)
-    assert found["times"] == sorted(found["times"])
-    assert found["sequences"] == list(range(1, found["count"] + 1))
-    assert len(found["topics"]["/log/0"]["messages"]) == 400
 
 
 def test_an_imported_recording_is_decoded_without_crazyem(tmp_path):
@@ -151,9 +109,8 @@ def test_an_imported_recording_is_decoded_without_crazyem(tmp_path):
         values = [[m[f"{name}_{a}"] for a in axes] for m in state]
         assert values == recording.signals[name].value.tolist()
     assert [m["time"] for m in state] == recording.signals["position"].time.tolist()
-    assert [m["voltage"] for m in topics["/signals/power"]["messages"]] == recording.signals["voltage"].value[
-        :, 0
-    ].tolist()
+    voltage = recording.signals["voltage"].value[:, 0].tolist()
+    assert [m["voltage"] for m in topics["/signals/power"]["messages"]] == voltage
     pose = topics["/pose"]["messages"]
     assert 70 <= len(pose) <= 76  # 25 a second for three seconds
     assert pose[0]["pose"]["position"] == dict(zip("xyz", recording.signals["position"].value[0].tolist(), strict=True))
@@ -168,22 +125,6 @@ def test_a_recovered_recording_is_decoded_without_crazyem(tmp_path):
     found = read_elsewhere(target, tmp_path)
     assert found["count"] == len(found["sequences"]) > 0
     assert found["times"] == sorted(found["times"])
-
-
-def test_channel_metadata_holds_the_true_names(tmp_path):
-    from mcap.reader import make_reader
-
-    path = tmp_path / "f.mcap"
-    write_recording(flight(), path)
-    with path.open("rb") as stream:
-        channels = make_reader(stream).get_summary().channels.values()
-    told = {c.topic: json.loads(c.metadata["signals"]) for c in channels if c.topic.startswith("/signals/")}
-    position = next(s for s in told["/signals/state"] if s["name"] == "position")
-    assert position["unit"] == "m"
-    assert position["frame"] == "world"
-    assert position["clock"] == "firmware"
-    assert position["source"] == ["position"]
-    assert position["components"] == ["position_x", "position_y", "position_z"]
 
 
 def packets_in(path):
@@ -215,8 +156,6 @@ def test_kill_9_loses_only_what_was_not_flushed(tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
-    assert process.stdin is not None
-    assert process.stdout is not None
     assert process.stdout.readline() == "written\n"
     patience = time.monotonic() + 60.0
     while packets_in(path) < 200:
@@ -225,15 +164,12 @@ def test_kill_9_loses_only_what_was_not_flushed(tmp_path):
     process.stdin.write("\n")
     process.stdin.flush()
     assert process.stdout.readline() == "more\n"
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    process.stdin.close()
-    process.stdout.close()
+    process.kill()
+    process.communicate()
     recording = open_recording(path)
     assert 200 <= recording.signals["voltage"].time.size <= 300
     assert recording.notices
     mended = tmp_path / "mended.mcap"
     report = recover(path, mended)
     assert report.lost_messages == 0
-    assert open_recording(mended).signals["voltage"].time.size == recording.signals["voltage"].time.size
-    assert os.path.getsize(mended) > 0
+    assert packets_in(mended) == packets_in(path)

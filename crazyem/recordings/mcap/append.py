@@ -9,12 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mcap.records import MetadataIndex, Schema
+from mcap.records import Channel, MetadataIndex
 
 from crazyem.errors import FileFormatError
 from crazyem.recordings.mcap.messages import PROFILE
 from crazyem.recordings.mcap.output import Book, index_record, note_chunk
 from crazyem.recordings.mcap.scan import DATA_END, HEAD, MCAP_MAGIC, MESSAGE_INDEX, METADATA, Loss, Problem
+from crazyem.recordings.mcap.schemas import session_of
 from crazyem.recordings.mcap.survey import Part, index_of, parse, parts, profile_of
 
 
@@ -55,7 +56,7 @@ def reopen(path: Path) -> Continued:
     damaged = next((p for p in problems if p.loss is Loss.DAMAGED), None)
     if damaged is not None:
         raise FileFormatError(f"{path} is damaged at byte {damaged.offset}; recover it before it is continued.")
-    if any(topic.startswith("/signals/") for topic in (c.topic for c in found.book.channels.values())):
+    if any(channel.topic.startswith("/signals/") for channel in found.book.channels.values()):
         raise FileFormatError(f"{path} is an imported recording, to which no flight can be added.")
     missing = found.close_chunk()
     stream = _Tail(path, found.end, missing)
@@ -82,8 +83,8 @@ class _Found:
         self.end = record.end
         for entry in part.announced:
             self.book.announce(entry)
-            number = "1" if isinstance(entry, Schema) else entry.metadata.get("session", "1")
-            self.sessions = max(self.sessions, int(number) if number.isdecimal() and len(number) < 6 else 1)
+            if isinstance(entry, Channel):
+                self.sessions = max(self.sessions, session_of(entry.metadata))
         if part.chunk is not None:
             self._chunk = part
         if part.scan is not None and part.scan.messages.size:
@@ -130,11 +131,5 @@ class _Tail:
             self._begun = True
         return self._file.write(data)
 
-    def flush(self) -> None:
-        self._file.flush()
-
-    def fileno(self) -> int:
-        return self._file.fileno()
-
-    def close(self) -> None:
-        self._file.close()
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)

@@ -12,7 +12,7 @@ from crazyem.recordings.contents import GrowingArray
 from crazyem.recordings.mcap import scan as mcap_scan
 from crazyem.recordings.mcap import schemas
 from crazyem.recordings.mcap.messages import EVENT_TOPICS, OTHER_EVENT_TOPIC, fields_of
-from crazyem.recordings.mcap.stream_codec import MOST_FIELDS, MOST_SIGNALS, FixedMessages, StreamLayout, block_messages
+from crazyem.recordings.mcap.stream_codec import MOST_FIELDS, MOST_SIGNALS, FixedMessages, StreamLayout
 from crazyem.recordings.mcap.survey import Part, parse
 from crazyem.recordings.recording import Event, SignalArray
 from crazyem.recordings.tables import Table
@@ -131,7 +131,7 @@ class Content:
         self.unreadable = 0
         self.messages = 0
         self._schemas: dict[int, str] = {}
-        self._told: dict[int, Any] = {}  # channel records, to notice another one with the same number
+        self._channels: dict[int, Any] = {}  # records, to notice another one with the same number
         self._blocks: dict[int, _BlockChannel] = {}
         self._streams: dict[int, _StreamChannel] = {}
         self._kinds: dict[int, tuple[str, Any]] = {}
@@ -158,12 +158,13 @@ class Content:
         for record in records:
             if not hasattr(record, "topic"):
                 self._schemas[record.id] = record.name
-            elif self._told.get(record.id) != record:
-                self._told[record.id] = record
+            elif self._channels.get(record.id) != record:
+                self._channels[record.id] = record
                 self._channel(record)
 
     def _channel(self, record: Any) -> None:
         name = self._schemas.get(record.schema_id, "")
+        expected = self._expected.get(record.id, 0)
         for known in (self._blocks, self._streams, self._kinds):
             known.pop(record.id, None)
         try:
@@ -171,14 +172,12 @@ class Content:
                 block = schemas.block_from_metadata(record.metadata)
                 if len(block.variables) > MOST_FIELDS:
                     raise ValueError("too many variables")
-                number = record.metadata.get("session", "1")
-                session = int(number) if number.isdecimal() and len(number) < 6 else 1
-                rows = _Rows(block_messages(block), [1, 1, len(block.variables)], self._expected.get(record.id, 0))
-                self._blocks[record.id] = _BlockChannel(block, session, rows)
+                count = len(block.variables)
+                rows = _Rows(FixedMessages(["<i8", *["<f8"] * (1 + count)]), [1, 1, count], expected)
+                self._blocks[record.id] = _BlockChannel(block, schemas.session_of(record.metadata), rows)
             elif name.startswith("crazyem.signals."):
                 layout = StreamLayout.from_metadata(record.metadata)
-                expected = self._expected.get(record.id, 0)
-                groups = [*(1 for _ in range(layout.first)), *(s.width for s in layout.signals)]
+                groups = [*[1] * layout.first, *(s.width for s in layout.signals)]
                 self._streams[record.id] = _StreamChannel(layout, _Rows(layout.messages, groups, expected))
             elif name in _KINDS and record.topic == EVENT_TOPICS[_KINDS[name]][0]:
                 self._kinds[record.id] = (_KINDS[name], schemas.message_class(name))

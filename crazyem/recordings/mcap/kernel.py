@@ -15,51 +15,43 @@ def _number(data, at, size):
 
 
 @compiled
-def count(data, counts):
-    """Write the numbers of messages and other records to `counts`; returns -1 if a record is not valid in a chunk."""
-    at = 0
-    size = data.size
-    while at < size:
-        if size - at < 9:
-            return -1
-        opcode = data[at]
-        length = _number(data, at + 1, 8)
-        if length < 0 or length > size - at - 9:
-            return -1
-        if opcode == 5:
-            if length < 22:
-                return -1
-            counts[0] += 1
-        elif opcode in (3, 4):
-            counts[1] += 1
-        else:
-            return -1
-        at += 9 + length
-    return 0
+def chunk_records(data, messages, others):
+    """Numbers of messages and of other records; -1, -1 if a record is not valid in a chunk.
 
-
-@compiled
-def fill(data, messages, others):
-    """Fill the tables of `Scan`; `count` must have accepted the data."""
+    The records are written to the tables of `Scan` as far as these have rows.
+    """
     at = 0
     m = 0
     k = 0
-    while at < data.size:
+    size = data.size
+    while at < size:
+        if size - at < 9:
+            return -1, -1
+        opcode = data[at]
         length = _number(data, at + 1, 8)
-        if data[at] == 5:
-            messages[m, 0] = at + 31
-            messages[m, 1] = length - 22
-            messages[m, 2] = _number(data, at + 9, 2)
-            messages[m, 3] = _number(data, at + 15, 8)
-            messages[m, 4] = _number(data, at + 23, 8)
-            messages[m, 5] = _number(data, at + 11, 4)
+        if length < 0 or length > size - at - 9:
+            return -1, -1
+        if opcode == 5:
+            if length < 22:
+                return -1, -1
+            if m < messages.shape[0]:
+                messages[m, 0] = at + 31
+                messages[m, 1] = length - 22
+                messages[m, 2] = _number(data, at + 9, 2)
+                messages[m, 3] = _number(data, at + 15, 8)
+                messages[m, 4] = _number(data, at + 23, 8)
+                messages[m, 5] = _number(data, at + 11, 4)
             m += 1
-        else:
-            others[k, 0] = data[at]
-            others[k, 1] = at + 9
-            others[k, 2] = length
+        elif opcode in (3, 4):
+            if k < others.shape[0]:
+                others[k, 0] = opcode
+                others[k, 1] = at + 9
+                others[k, 2] = length
             k += 1
+        else:
+            return -1, -1
         at += 9 + length
+    return m, k
 
 
 @compiled

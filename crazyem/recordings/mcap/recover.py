@@ -5,14 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crazyem.atomic_file import new_file
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings.mcap import scan as mcap_scan
 from crazyem.recordings.mcap.messages import PROFILE
 from crazyem.recordings.mcap.output import Output
-from crazyem.recordings.mcap.scan import HEAD, MCAP_MAGIC, Loss, Problem, Scan
+from crazyem.recordings.mcap.scan import HEAD, MCAP_MAGIC, Loss, Problem
 from crazyem.recordings.mcap.survey import Part, from_summary, index_of, parse, parts, profile_of
 
 
@@ -92,9 +91,9 @@ def _copy(source: Path, head: bytes, output: Output) -> Report:
     output.start(report.profile, "crazyem recover")
     # the summary repeats announcements that may be lost in a damaged chunk
     known = {(type(r).__name__, r.id): r for r in from_summary(source)[0]}
-    counter = _Sequence()
     seen: set[tuple[str, int]] = set()
     summary = False
+    newest = lost = 0  # sequence numbers are consecutive in a whole file of crazyem
     for part in parts(source, report.problems):
         summary = summary or part.record.opcode == mcap_scan.DATA_END
         for entry in part.announced:
@@ -104,7 +103,10 @@ def _copy(source: Path, head: bytes, output: Output) -> Report:
         if part.scan is not None:
             _restore(output, part, known, seen)
             _messages(output, part, report)
-            counter.take(part)
+            numbers = part.scan.messages[:, 5]
+            if numbers.size:
+                lost += max(int(numbers[0]) - newest - 1, 0)
+                newest = int(numbers[-1])
         elif part.record.opcode == mcap_scan.METADATA:
             record = parse(mcap_scan.METADATA, part.record.data)
             if record is not None:
@@ -112,7 +114,7 @@ def _copy(source: Path, head: bytes, output: Output) -> Report:
                 report.metadata += 1
         elif part.record.opcode == mcap_scan.ATTACHMENT:
             report.attachments += _attachment(source, part, output)
-    report.lost_messages = counter.lost if report.profile == PROFILE else None
+    report.lost_messages = lost if report.profile == PROFILE else None
     output.finish()
     return report
 
@@ -137,38 +139,29 @@ def _restore(output: Output, part: Part, known: dict[tuple[str, int], Any], seen
 
 
 def _messages(output: Output, part: Part, report: Report) -> None:
-    """Copy a chunk byte for byte; records outside chunks are written as a chunk."""
+    """Copy a chunk byte for byte; records outside chunks, and a part of a chunk, are written as a chunk."""
     assert part.scan is not None
-    messages = part.scan.messages
-    book = output.book
+    scan, book = part.scan, output.book
     known = [c.id for c in book.channels.values() if c.schema_id == 0 or c.schema_id in book.schemas]
-    defined = np.isin(messages[:, 2], known)  # messages of announced channels, which a reader can decode
+    defined = np.isin(scan.messages[:, 2], known)  # messages of announced channels, which a reader can decode
+    messages = scan.messages[defined]
     if not defined.all():
         why = f"{int((~defined).sum())} messages of channels that nothing announces any more"
         report.problems.append(Problem(Loss.DAMAGED, part.record.offset, part.record.end, why))
-        _rewrite(output, part.scan, messages[defined])
-    index = index_of(messages[defined])
-    if not index:
+    if not len(messages):
         output.announce_again()
         return
-    report.messages += int(defined.sum())
+    report.messages += len(messages)
     report.chunks += 1
     if not defined.all():
-        return
-    if part.chunk is not None:
+        packed = b"".join(scan.data[at - 31 : at + length].tobytes() for at, length, *_ in messages.tolist())
+        output.messages(packed, index_of(mcap_scan.scan(packed).messages))
+    elif part.chunk is not None:
         chunk = part.chunk
         output.flush_announcements()
-        output.chunk(chunk.compression, bytes(chunk.packed), size=chunk.size, crc=chunk.crc, index=index)
+        output.chunk(chunk.compression, bytes(chunk.packed), size=chunk.size, crc=chunk.crc, index=index_of(messages))
     else:
-        output.messages(part.scan.data.tobytes(), index)
-
-
-def _rewrite(output: Output, scan: Scan, messages: NDArray[np.int64]) -> None:
-    """Write some messages of a chunk to a new chunk."""
-    records = [scan.data[offset - 31 : offset + length].tobytes() for offset, length, *_ in messages.tolist()]
-    if records:
-        packed = b"".join(records)
-        output.messages(packed, index_of(mcap_scan.scan(packed).messages))
+        output.messages(scan.data.tobytes(), index_of(messages))
 
 
 def _attachment(source: Path, part: Part, output: Output) -> int:
@@ -180,18 +173,3 @@ def _attachment(source: Path, part: Part, output: Output) -> int:
         return 0
     output.attachment(record)
     return 1
-
-
-class _Sequence:
-    """Counts lost messages by sequence numbers, which are consecutive in a whole file of crazyem."""
-
-    def __init__(self) -> None:
-        self.newest = 0
-        self.lost = 0
-
-    def take(self, part: Part) -> None:
-        assert part.scan is not None
-        numbers = part.scan.messages[:, 5]
-        if numbers.size:
-            self.lost += max(int(numbers[0]) - self.newest - 1, 0)
-            self.newest = int(numbers[-1])

@@ -13,7 +13,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import BinaryIO
 
+import lz4.frame
 import numpy as np
+import zstandard
 from numpy.typing import NDArray
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -114,14 +116,12 @@ def records(stream: BinaryIO, problems: list[Problem]) -> Iterator[Record]:
                 data = None
         if data is None:
             found = _next_chunk(stream, offset + 1, size)
-            if found is None:
-                beyond = end > size and (0 < opcode <= DATA_END or len(head) < HEAD.size)
-                if beyond:
-                    problems.append(Problem(Loss.CUT, offset, size, "the file ends in the middle of a record"))
-                else:
-                    problems.append(Problem(Loss.DAMAGED, offset, size, "the bytes are no record"))
+            if found is None and end > size and (0 < opcode <= DATA_END or len(head) < HEAD.size):
+                problems.append(Problem(Loss.CUT, offset, size, "the file ends in the middle of a record"))
                 return
-            problems.append(Problem(Loss.DAMAGED, offset, found, "the bytes are no record"))
+            problems.append(Problem(Loss.DAMAGED, offset, found or size, "the bytes are no record"))
+            if found is None:
+                return
             offset = found
             continue
         closed = opcode == FOOTER
@@ -162,15 +162,10 @@ def _consistent(opcode: int, data: bytes) -> bool:
 
 
 def _is_chunk(data: bytes) -> bool:
-    if len(data) < _CHUNK_HEAD.size + 8:
+    try:
+        return parse_chunk(data).compression in ("", "lz4", "zstd")
+    except ValueError:
         return False
-    name = int.from_bytes(data[28:32], "little")
-    at = _CHUNK_HEAD.size + name + 8
-    return (
-        name in (0, 3, 4)
-        and data[28 + 4 : 32 + name] in (b"", b"lz4", b"zstd")
-        and (int.from_bytes(data[at - 8 : at], "little") == len(data) - at)
-    )
 
 
 def _next_chunk(stream: BinaryIO, offset: int, size: int) -> int | None:
@@ -209,14 +204,10 @@ def unpack(chunk: PackedChunk) -> bytes:
     """The records of a chunk, unpacked and checked. Raises ValueError, with the reason."""
     if chunk.size > LARGEST_CHUNK:
         raise ValueError(f"a chunk claims {chunk.size} bytes, more than {LARGEST_CHUNK}")
-    if chunk.compression == "zstd":
-        data = _unpack_zstd(chunk)
-    elif chunk.compression == "lz4":
-        data = _unpack_lz4(chunk)
-    elif chunk.compression == "":
-        data = bytes(chunk.packed)
-    else:
-        raise ValueError(f"unknown compression {chunk.compression!r}")
+    try:
+        data = _unpacked(chunk)
+    except (RuntimeError, EOFError, MemoryError, zstandard.ZstdError) as error:
+        raise ValueError("a chunk does not unpack") from error
     if len(data) != chunk.size:
         raise ValueError("a chunk does not unpack to its size")
     if chunk.crc and zlib.crc32(data) != chunk.crc:
@@ -224,39 +215,27 @@ def unpack(chunk: PackedChunk) -> bytes:
     return data
 
 
-def _unpack_zstd(chunk: PackedChunk) -> bytes:
-    import zstandard
-
-    # reading one byte more than the claimed size detects a larger chunk without unpacking all of it
-    try:
-        with zstandard.ZstdDecompressor(max_window_size=2 * LARGEST_CHUNK).stream_reader(
-            chunk.packed, read_across_frames=True
-        ) as reader:
-            parts = [reader.read(chunk.size)] if chunk.size else []
-            parts.append(reader.read(1))
-        return b"".join(parts) if parts[-1] else parts[0] if len(parts) > 1 else b""
-    except (zstandard.ZstdError, MemoryError) as error:
-        raise ValueError("a chunk does not unpack") from error
-
-
-def _unpack_lz4(chunk: PackedChunk) -> bytes:
-    import lz4.frame
-
-    try:
+def _unpacked(chunk: PackedChunk) -> bytes:
+    """The chunk unpacked, at most one byte more than its claimed size, which shows that the claim is false."""
+    if chunk.compression == "zstd":
+        decompressor = zstandard.ZstdDecompressor(max_window_size=2 * LARGEST_CHUNK)
+        with decompressor.stream_reader(chunk.packed, read_across_frames=True) as reader:
+            return reader.read(chunk.size + 1)
+    if chunk.compression == "lz4":
         return bytes(lz4.frame.LZ4FrameDecompressor().decompress(bytes(chunk.packed), max_length=chunk.size + 1))
-    except (RuntimeError, EOFError, MemoryError) as error:
-        raise ValueError("a chunk does not unpack") from error
+    if chunk.compression == "":
+        return bytes(chunk.packed)
+    raise ValueError(f"unknown compression {chunk.compression!r}")
 
 
 def scan(data: bytes) -> Scan:
     """The records in the bytes of a chunk. Raises ValueError where they make no sense."""
-    from crazyem.recordings.mcap.kernel import count, fill  # numba takes a second to import
+    from crazyem.recordings.mcap.kernel import chunk_records  # numba takes a second to import
 
     array = np.frombuffer(data, np.uint8)
-    counts = np.zeros(2, np.int64)
-    if count(array, counts) < 0 or counts[1] > MOST_DEFINITIONS:
+    count, definitions = chunk_records(array, np.empty((0, 6), np.int64), np.empty((0, 3), np.int64))
+    if count < 0 or definitions > MOST_DEFINITIONS:
         raise ValueError("the records in a chunk make no sense")
-    messages = np.empty((counts[0], 6), np.int64)
-    others = np.empty((counts[1], 3), np.int64)
-    fill(array, messages, others)
+    messages, others = np.empty((count, 6), np.int64), np.empty((definitions, 3), np.int64)
+    chunk_records(array, messages, others)
     return Scan(array, messages, others)

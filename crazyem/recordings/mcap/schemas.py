@@ -8,7 +8,7 @@ Log packets have one message type per block and one field per variable. `struct`
 import functools
 import json
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -115,6 +115,11 @@ def message_class(name: str) -> Any:
     for file in _files():
         pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
+
+
+def encode(name: str, fields: Mapping[str, Any]) -> bytes:
+    """The bytes of a message with these fields."""
+    return bytes(message_class(name)(**fields).SerializeToString())
 
 
 @functools.cache

@@ -7,6 +7,7 @@ sources; events, findings and metadata. docs/reference/formats/mcap.md describes
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -76,23 +77,25 @@ def _write(recording: Recording, output: Output) -> None:
 # --- which signals share messages -------------------------------------------------------------------------------------
 
 
+@dataclass
 class _Group:
-    """Signals of one stream whose samples were taken and processed together, row by row."""
+    """Signals of one stream whose samples were taken and processed together, row by row.
 
-    def __init__(self, stream: str) -> None:
-        self.stream = stream
-        self.names: list[str] = []
-        self.indices: list[int] = []
-        self.arrays: list[SignalArray] = []
-        self.base: NDArray[np.int64] = np.empty(0, np.int64)
+    Attributes:
+        base: (n,) places of the samples of the first signal in the processing order.
+        indices: places of the signals in the recording.
+    """
 
-    @property
-    def width(self) -> int:
-        return sum(array.value.shape[1] for array in self.arrays)
+    stream: str
+    base: NDArray[np.int64]
+    names: list[str] = field(default_factory=list)
+    indices: list[int] = field(default_factory=list)
+    arrays: list[SignalArray] = field(default_factory=list)
 
     def takes(self, array: SignalArray, rank: NDArray[np.int64]) -> bool:
         """Whether `array` fits into the same messages, after the present arrays."""
-        if len(self.arrays) >= MOST_SIGNALS or self.width + array.value.shape[1] > MOST_FIELDS:
+        width = sum(a.value.shape[1] for a in (*self.arrays, array))
+        if len(self.arrays) >= MOST_SIGNALS or width > MOST_FIELDS:
             return False
         mine = self.arrays[0]
         return (
@@ -118,8 +121,7 @@ def _groups(signals: Mapping[str, SignalArray], places: Mapping[str, NDArray[np.
         # only the newest group of a stream: its signals are neighbours in the processing order
         newest = next((g for g in reversed(groups) if g.stream == array.stream), None)
         if newest is None or not newest.takes(array, places[name]):
-            newest = _Group(array.stream)
-            newest.base = places[name]
+            newest = _Group(array.stream, places[name])
             groups.append(newest)
         newest.names.append(name)
         newest.indices.append(index[name])
@@ -190,12 +192,15 @@ class _Clock:
             return (host_time if self.host_known else time + self.shift) * 1e9
 
 
+@dataclass
 class _Extra:
     """A message beside the samples; `key` is its place among them, NaN: placed by its `log_time` [ns, 0: unknown]."""
 
-    def __init__(self, channel: int, data: bytes, *, key: float = math.nan, log_time: int, publish: int = -1) -> None:
-        self.channel, self.data, self.key = channel, data, key
-        self.log_time, self.publish = log_time, publish
+    channel: int
+    data: bytes
+    log_time: int
+    key: float = math.nan
+    publish: int | None = None  # time of publication [ns], None: as `log_time` in the file
 
 
 class _Merge:
@@ -256,7 +261,7 @@ class _Merge:
             extra = self.extras[int(done[-1])]
             done[-1] += 1
             time, offset = int(times[at]), int(offsets[at])
-            publish = time if extra.publish < 0 else extra.publish
+            publish = time if extra.publish is None else extra.publish
             head = MESSAGE_HEAD.pack(
                 MESSAGE, 22 + len(extra.data), extra.channel, (first + at + 1) & 0xFFFFFFFF, time, publish
             )
@@ -328,8 +333,7 @@ def _poses(
         nanoseconds = int(min(max(stamp, 0.0), 9.0e18))
         key = float(places["position"][row]) + 0.25
         for topic, schema, fields in pose_messages(nanoseconds, translation, rotation):
-            data = schemas.message_class(schema)(**fields).SerializeToString()
-            extras.append(_Extra(_channel(output, topic, schema), data, key=key, log_time=nanoseconds))
+            extras.append(_Extra(_channel(output, topic, schema), schemas.encode(schema, fields), nanoseconds, key))
     return extras
 
 
@@ -337,30 +341,29 @@ def _events(output: Output, recording: Recording, clock: _Clock) -> list[_Extra]
     """Events as messages of their own kind if this is lossless, else as JSON."""
     extras = []
     for event in recording.events:
-        found = _native(event)
-        if found is None:
+        topic, schema = EVENT_TOPICS.get(event.kind, OTHER_EVENT_TOPIC)
+        data = _native(event)
+        if data is None:
             topic, schema = OTHER_EVENT_TOPIC
             fields = {"time": event.time, "kind": event.kind, "json": json.dumps(dict(event.data), default=str)}
-            found = topic, schema, schemas.message_class(schema)(**fields).SerializeToString()
-        topic, schema, data = found
+            data = schemas.encode(schema, fields)
         stamp = _nanoseconds(event.time)
         shown = stamp if clock.host_known or clock.shift > _EPOCH_RANGE[0] else 0
-        extras.append(_Extra(_channel(output, topic, schema), data, log_time=shown, publish=max(stamp, 0)))
+        extras.append(_Extra(_channel(output, topic, schema), data, shown, publish=stamp))
     return extras
 
 
-def _native(event: Event) -> tuple[str, str, bytes] | None:
+def _native(event: Event) -> bytes | None:
     """The event as a message of its own kind, None if this would lose data."""
     if event.kind not in EVENT_TOPICS or _nanoseconds(event.time) / 10**9 != event.time:
         return None
-    topic, schema = EVENT_TOPICS[event.kind]
-    message = schemas.message_class(schema)
+    schema = EVENT_TOPICS[event.kind][1]
     try:
-        data = message(**event.data).SerializeToString()
-        same = repr(fields_of(message.FromString(data))) == repr(dict(event.data))
+        data = schemas.encode(schema, event.data)
+        same = repr(fields_of(schemas.message_class(schema).FromString(data))) == repr(dict(event.data))
     except (TypeError, ValueError, AttributeError):
         return None
-    return (topic, schema, data) if same else None
+    return data if same else None
 
 
 def _nanoseconds(seconds: float) -> int:
@@ -378,6 +381,6 @@ def _notes(output: Output, recording: Recording) -> list[_Extra]:
             "message": f"{finding.signal}: {finding.text}" if finding.signal else finding.text,
             "name": finding.check,
         }
-        data = schemas.message_class("foxglove.Log")(**fields).SerializeToString()
-        extras.append(_Extra(_channel(output, FINDINGS_TOPIC, "foxglove.Log"), data, log_time=0))
+        channel = _channel(output, FINDINGS_TOPIC, "foxglove.Log")
+        extras.append(_Extra(channel, schemas.encode("foxglove.Log", fields), log_time=0))
     return extras

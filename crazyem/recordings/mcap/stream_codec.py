@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.recordings.mcap import schemas
-from crazyem.signals.sample import Block
 
 MOST_SIGNALS = 60  # in one message; each has a bit in `marked`
 MOST_FIELDS = 4096  # in one message; guards against damaged metadata
@@ -30,21 +29,15 @@ class FixedMessages:
     """
 
     def __init__(self, kinds: Sequence[str]) -> None:
-        tags = [schemas.tag(number, 1) for number in range(1, len(kinds) + 1)]
-        offsets, at = [], 0
-        for tag in tags:
-            offsets.append(at + len(tag))
-            at += len(tag) + 8
-        self.size = at
+        tags = [schemas.tag(number) for number in range(1, len(kinds) + 1)]
+        offsets = np.cumsum([len(tag) + 8 for tag in tags]) - 8
+        self.size = int(offsets[-1]) + 8
+        names = [str(i) for i in range(len(kinds))]
         self._dtype = np.dtype(
-            {"names": [str(i) for i in range(len(kinds))], "formats": list(kinds), "offsets": offsets, "itemsize": at}
+            {"names": names, "formats": list(kinds), "offsets": offsets.tolist(), "itemsize": self.size}
         )
-        self._blank = np.zeros(at, np.uint8)
-        fixed = np.ones(at, bool)
-        for tag, offset in zip(tags, offsets, strict=True):
-            self._blank[offset - len(tag) : offset] = np.frombuffer(tag, np.uint8)
-            fixed[offset : offset + 8] = False
-        self._tags = np.flatnonzero(fixed)
+        self._blank = np.frombuffer(b"".join(tag + bytes(8) for tag in tags), np.uint8)
+        self._tags = np.delete(np.arange(self.size), offsets[:, None] + np.arange(8))
 
     def encode(self, columns: Sequence[NDArray[Any]]) -> NDArray[np.uint8]:
         """(n, size) bytes of n messages, from one (n,) array per field."""
@@ -68,11 +61,6 @@ class FixedMessages:
             gather(data, offsets, rows)
         sound = (rows[:, self._tags] == self._blank[self._tags]).all(axis=1)
         return rows.view(self._dtype)[:, 0], sound
-
-
-def block_messages(block: Block) -> FixedMessages:
-    """The messages of a log block (`schemas.BlockCodec`): firmware_time_ms, host_time, then its variables."""
-    return FixedMessages(["<i8", "<f8", *("<f8" for _ in block.variables)])
 
 
 @dataclass(frozen=True, slots=True)

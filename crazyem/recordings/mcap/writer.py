@@ -120,13 +120,10 @@ class RecordingWriter:
     def _begin(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
         if self.session == 1:
             self._output.start(PROFILE, f"crazyem {versions()['crazyem']}")
-        self._output.metadata(*self._section("crazyem", versions()))
+        self._write_metadata("crazyem", versions())
         for section, entries in metadata.items():
             self._write_metadata(section, {k: str(v) for k, v in entries.items()})
         self._output.flush(sync=True)
-
-    def _section(self, name: str, entries: Mapping[str, str]) -> tuple[str, Mapping[str, str]]:
-        return (name if self.session == 1 else f"session {self.session}: {name}"), entries
 
     def __enter__(self) -> "RecordingWriter":
         return self
@@ -241,7 +238,8 @@ class RecordingWriter:
         return self._channels[topic]
 
     def _write_metadata(self, section: str, entries: dict[str, str]) -> None:
-        self._output.metadata(*self._section(section, entries))
+        name = section if self.session == 1 else f"session {self.session}: {section}"
+        self._output.metadata(name, entries)
 
     def _write_blocks(self, blocks: tuple[Block, ...]) -> None:
         for block in blocks:
@@ -249,8 +247,8 @@ class RecordingWriter:
                 continue
             codec = schemas.BlockCodec(block)
             schema = self._output.schema(codec.schema_name, "protobuf", codec.schema_data())
-            told = {**codec.metadata(), "session": str(self.session)}
-            channel = self._output.channel(f"/log/{block.identifier}", "protobuf", schema, told)
+            metadata = {**codec.metadata(), "session": str(self.session)}
+            channel = self._output.channel(f"/log/{block.identifier}", "protobuf", schema, metadata)
             self._codecs[block.identifier] = (channel, codec)
             self._blocks[block.identifier] = block
         shown = decoders(self._blocks.values())
@@ -334,18 +332,10 @@ class RecordingWriter:
         self._write(*EVENT_TOPICS["estimate"], host_time, fields)
 
     def _write_link(self, host_time: float, statistics: LinkStatistics, latency: float) -> None:
-        fields: dict[str, Any] = {
-            "host_time": host_time,
-            "received": statistics.received,
-            "lost": statistics.lost,
-            "late": statistics.late,
-            "latency": latency,
-            "round_trip": statistics.round_trip,
-            "clock_offset": statistics.clock_offset,
-            "clock_rate": statistics.clock_rate,
-            "outages": statistics.outages,
-        }
-        before, fields["rate"], fields["loss"] = self._link_before, math.nan, math.nan
+        names = ("received", "lost", "late", "round_trip", "clock_offset", "clock_rate", "outages")
+        fields: dict[str, Any] = {name: getattr(statistics, name) for name in names}
+        fields |= {"host_time": host_time, "latency": latency, "rate": math.nan, "loss": math.nan}
+        before = self._link_before
         if before is not None and host_time > before[0]:
             received, lost = statistics.received - before[1], statistics.lost - before[2]
             fields["rate"] = received / (host_time - before[0])
@@ -355,9 +345,8 @@ class RecordingWriter:
 
     def _write_residual(self, time: float, host_time: float, values: tuple[float, ...], sd: tuple[float, ...]) -> None:
         fields = {"time": float(time), "host_time": host_time}
-        names = [f"{w}_{a}" for w in ("position", "velocity", "attitude", "body_rate") for a in "xyz"]
-        fields.update(zip(names, values, strict=True))
-        fields.update(zip((f"{n}_sd" for n in names), sd, strict=True))
+        for name, value, deviation in zip(schemas.RESIDUALS.split(), values, sd, strict=True):
+            fields |= {name: value, f"{name}_sd": deviation}
         self._write(*EVENT_TOPICS["residual"], host_time, fields)
 
     def _write_event(self, host_time: float, text: str, level: str) -> None:
@@ -366,9 +355,7 @@ class RecordingWriter:
         self._write(*EVENT_TOPICS["log"], host_time, fields)
 
     def _write(self, topic: str, schema: str, host_time: float, fields: dict[str, Any]) -> None:
-        self._message(
-            self._channel(topic, schema), host_time, schemas.message_class(schema)(**fields).SerializeToString()
-        )
+        self._message(self._channel(topic, schema), host_time, schemas.encode(schema, fields))
 
 
 def _now() -> float:
