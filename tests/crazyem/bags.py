@@ -1,16 +1,18 @@
-"""Writes rosbag2 MCAP files for tests, with mcap-ros2-support and hand-written message definitions."""
+"""Writes rosbag2 MCAP files for tests, with mcap-ros2-support."""
 
 import io
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from mcap.writer import CompressionType
+from mcap.writer import Writer as PlainWriter
 from mcap_ros2.writer import Writer
+from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 START = 1_700_000_000_000_000_000  # ns since 1970
 LINE = "=" * 80
+_STORE = get_typestore(Stores.ROS2_HUMBLE)
 HEADER = f"{LINE}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
 HEADER += f"{LINE}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
 POINT = f"{LINE}\nMSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n"
@@ -18,16 +20,9 @@ VECTOR = f"{LINE}\nMSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n
 QUATERNION = f"{LINE}\nMSG: geometry_msgs/Quaternion\nfloat64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n"
 POSE = f"{LINE}\nMSG: geometry_msgs/Pose\nPoint position\nQuaternion orientation\n{POINT}{QUATERNION}"
 TWIST = f"{LINE}\nMSG: geometry_msgs/Twist\nVector3  linear\nVector3  angular\n{VECTOR}"
-DEFINITIONS = {
+PUBLISHED = ("nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu", "tf2_msgs/msg/TFMessage", "std_msgs/msg/String")
+DEFINITIONS = {kind: _STORE.generate_msgdef(kind, ros_version=2)[0] for kind in PUBLISHED} | {
     "geometry_msgs/msg/PoseStamped": f"# a pose\nstd_msgs/Header header\ngeometry_msgs/Pose pose\n{HEADER}{POSE}",
-    "nav_msgs/msg/Odometry": "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
-    f"geometry_msgs/TwistWithCovariance twist\n{HEADER}{POSE}{TWIST}"
-    f"{LINE}\nMSG: geometry_msgs/PoseWithCovariance\nPose pose\nfloat64[36] covariance\n"
-    f"{LINE}\nMSG: geometry_msgs/TwistWithCovariance\nTwist twist\nfloat64[36] covariance\n",
-    "sensor_msgs/msg/Imu": "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\n"
-    "float64[9] orientation_covariance # row major\ngeometry_msgs/Vector3 angular_velocity\n"
-    "float64[9] angular_velocity_covariance\ngeometry_msgs/Vector3 linear_acceleration\n"
-    f"float64[9] linear_acceleration_covariance\n{HEADER}{QUATERNION}{VECTOR}",
     "crazyflie_interfaces/msg/LogDataGeneric": "std_msgs/Header header  # when it was received\n"
     f"uint32 timestamp # in ms\nfloat32[] values\n{HEADER}",
     "crazyflie_interfaces/msg/Status": "uint16 SUPERVISOR_INFO_CAN_BE_ARMED = 1\nuint16 SUPERVISOR_INFO_IS_FLYING=16\n"
@@ -35,25 +30,34 @@ DEFINITIONS = {
     f"uint32 num_rx_broadcast\nuint32 num_tx_broadcast\nuint32 num_rx_unicast\nuint32 num_tx_unicast\n{HEADER}",
     "crazyflie_interfaces/msg/FullState": "std_msgs/Header header\ngeometry_msgs/Pose pose\ngeometry_msgs/Twist twist\n"
     f"geometry_msgs/Vector3 acc\n{HEADER}{POSE}{TWIST}",
-    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"
-    f"{LINE}\nMSG: geometry_msgs/TransformStamped\nstd_msgs/Header header\nstring child_frame_id\nTransform transform\n"
-    f"{LINE}\nMSG: geometry_msgs/Transform\nVector3 translation\nQuaternion rotation\n{HEADER}{VECTOR}{QUATERNION}",
     "motion_capture_tracking_interfaces/msg/NamedPoseArray": "std_msgs/Header header\nNamedPose[] poses\n"
     f"{LINE}\nMSG: motion_capture_tracking_interfaces/NamedPose\nstring name\ngeometry_msgs/Pose pose\n{HEADER}{POSE}",
-    "std_msgs/msg/String": "string data\n",
 }
 
 Message = tuple[str, str, int, Any]  # topic, type, log time, message
 
 
-def bag(messages: Iterable[Message], chunk: int = 2000, compression: CompressionType = CompressionType.ZSTD) -> bytes:
+def bag(messages: Iterable[Message], chunk: int = 2000) -> bytes:
     output = io.BytesIO()
-    writer = Writer(output, chunk_size=chunk, compression=compression)
+    writer = Writer(output, chunk_size=chunk)
     schemas: dict[str, Any] = {}
     for topic, kind, log, message in messages:
         if kind not in schemas:
             schemas[kind] = writer.register_msgdef(kind, DEFINITIONS[kind])
         writer.write_message(topic, schemas[kind], message, log_time=log, publish_time=log)
+    writer.finish()
+    return output.getvalue()
+
+
+def raw_bag(kind: str, definition: str, payloads: Iterable[bytes], chunk: int = 1 << 20) -> bytes:
+    """A bag of any bytes as messages of the topic /cf1/a."""
+    output = io.BytesIO()
+    writer = PlainWriter(output, chunk_size=chunk)
+    writer.start(profile="ros2", library="")
+    schema = writer.register_schema(kind, "ros2msg", definition.encode())
+    channel = writer.register_channel("/cf1/a", "cdr", schema)
+    for payload in payloads:
+        writer.add_message(channel, START, payload, START)
     writer.finish()
     return output.getvalue()
 
@@ -81,6 +85,11 @@ def random_poses(n: int, seed: int = 1) -> np.ndarray:
 
 def pose_message(topic: str, ns: int, values: Any, late: int = 700_000) -> Message:
     return topic, "geometry_msgs/msg/PoseStamped", ns + late, {"header": stamp(ns), "pose": pose(values)}
+
+
+def pose_messages(values: Iterable[Any], first: int = START, step: int = 10**7) -> list[Message]:
+    """Poses of the topic /cf1/pose, by default 100 a second."""
+    return [pose_message("/cf1/pose", first + i * step, v) for i, v in enumerate(values)]
 
 
 def odometry(topic: str, ns: int, values: Any, linear: Any, angular: Any = (0, 0, 0), child: str = "") -> Message:

@@ -11,7 +11,7 @@ import functools
 import keyword
 import operator
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,7 +32,7 @@ _CONSTANT = re.compile(r"\s*[A-Za-z]\w*(?:<=\d{1,9})?\s+[A-Za-z]\w*\s*=")
 _NUMBER_SIZES = {"bool": 1, "byte": 1, "char": 1, "float32": 4, "float64": 8}
 _NUMBER_SIZES |= {f"{sign}int{bits}": bits // 8 for sign in ("", "u") for bits in (8, 16, 32, 64)}
 _PRIMITIVE = {*_NUMBER_SIZES, "string", "wstring"}
-_TIMES = {"builtin_interfaces/Time": ("sec", "nanosec"), "builtin_interfaces/Duration": ("sec", "nanosec")}
+_TIMES = {"builtin_interfaces/Time", "builtin_interfaces/Duration"}  # of two numbers
 
 _Spec = dict[str, list[tuple[str, bool, int, str]]]  # type -> (type, array, fixed length or 0, name) of each field
 
@@ -67,16 +67,16 @@ def message_type(name: str, definition: str) -> MessageType:
     text, spec = _reduced(short, definition)
     _check(short, spec)
     try:
-        decode = _decoder(f"{short.replace('/', '/msg/')}", text)
+        decode = _decoder(short.replace("/", "/msg/"), text)
     except Exception as error:  # the parser raises many kinds
         raise ValueError(f"its definition cannot be parsed ({type(error).__name__})") from error
-    scalars: list[str] = []
-    arrays: list[tuple[str, int]] = []
-    strings: list[str] = []
-    _leaves(short, spec, "", scalars, arrays, strings)
+    leaves = list(_leaves(short, spec))
+    arrays = tuple((name, length) for base, array, length, name in leaves if array and base in _NUMBER_SIZES)
+    scalars = [name for base, array, _, name in leaves if not array and base in _NUMBER_SIZES]
+    strings = tuple(name for base, array, _, name in leaves if not array and base not in _NUMBER_SIZES)
     stamped = {"header.stamp.sec", "header.stamp.nanosec"} <= set(scalars)
     own = tuple(s for s in scalars if not (stamped and s.startswith("header.stamp.")))
-    return MessageType(short, decode, own, tuple(arrays), tuple(strings), stamped)
+    return MessageType(short, decode, own, arrays, strings, stamped)
 
 
 def _decoder(name: str, text: str) -> Callable[[bytes], Any]:
@@ -91,8 +91,7 @@ def _decoder(name: str, text: str) -> Callable[[bytes], Any]:
 def standard_definition(name: str) -> str | None:
     """The definition of a type for bags without definitions (older than 2023); None if unknown."""
     try:
-        package, _, kind = _short(name).partition("/")
-        return _standard().generate_msgdef(f"{package}/msg/{kind}", ros_version=2)[0]
+        return _standard().generate_msgdef(_short(name).replace("/", "/msg/"), ros_version=2)[0]
     except (KeyError, ValueError, TypesysError):
         return None
 
@@ -198,23 +197,16 @@ def _check(name: str, spec: _Spec) -> None:
     measure(name, 0)
 
 
-def _leaves(
-    kind: str, spec: _Spec, prefix: str, scalars: list[str], arrays: list[tuple[str, int]], strings: list[str]
-) -> None:
-    """Collect the dotted names of the fields of a message; arrays of messages are left out."""
+def _leaves(kind: str, spec: _Spec, prefix: str = "") -> Iterator[tuple[str, bool, int, str]]:
+    """The fields of a message as in `spec`, with dotted names; long arrays and arrays of messages are left out."""
     if kind in _TIMES and kind not in spec:
-        scalars += [prefix + part for part in _TIMES[kind]]
+        yield from (("uint32", False, 0, prefix + part) for part in ("sec", "nanosec"))
         return
     for base, array, length, name in spec[kind]:
-        if array:
-            if base in _NUMBER_SIZES and length <= _LARGEST_FIXED_ARRAY:
-                arrays.append((prefix + name, length))
-        elif base in _NUMBER_SIZES:
-            scalars.append(prefix + name)
-        elif base in _PRIMITIVE:
-            strings.append(prefix + name)
-        else:
-            _leaves(base, spec, f"{prefix}{name}.", scalars, arrays, strings)
+        if base not in _PRIMITIVE and not array:
+            yield from _leaves(base, spec, f"{prefix}{name}.")
+        elif length <= _LARGEST_FIXED_ARRAY:
+            yield base, array, length, prefix + name
 
 
 @dataclass(slots=True, eq=False)

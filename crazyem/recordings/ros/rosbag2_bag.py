@@ -132,8 +132,8 @@ class _Bag:
         elif connection.msgdef.format is not MessageDefinitionFormat.MSG:
             definition = None
         if definition is None:
-            name = "/" + connection.topic.strip("/")
-            self.refused[name] = f"the bag has no definition of {text_of(connection.msgtype)} that can be read here"
+            why = f"the bag has no definition of {text_of(connection.msgtype)} that can be read here"
+            self.refused[_name(connection.topic)] = why
             return None
         return self._announce(connection.topic, connection.msgtype, definition)
 
@@ -150,15 +150,13 @@ class _Bag:
 
     def _topic(self, channel: Any, schema: Any) -> BagTopic | None:
         """The topic of a channel if its messages can be decoded."""
-        name = "/" + str(channel.topic).strip("/")
         if schema is None or channel.message_encoding != "cdr" or schema.encoding != "ros2msg":
             encoding = f"{channel.message_encoding} with {schema.encoding if schema else 'no'} definitions"
-            self.refused[name] = f"its encoding is {text_of(encoding)}"
+            self.refused[_name(channel.topic)] = f"its encoding is {text_of(encoding)}"
             return None
-        return self._announce(str(channel.topic), str(schema.name), bytes(schema.data).decode("utf-8", "replace"))
+        return self._announce(channel.topic, schema.name, schema.data.decode("utf-8", "replace"))
 
     def _announce(self, topic: str, kind_name: str, definition: str) -> BagTopic | None:
-        name = "/" + topic.strip("/")
         key = (kind_name, definition)
         if key not in self._types:
             try:
@@ -166,6 +164,7 @@ class _Bag:
             except ValueError as error:
                 self._types[key] = str(error)
         kind = self._types[key]
+        name = _name(topic)
         if isinstance(kind, str):
             self.refused[name] = kind
             return None
@@ -188,18 +187,22 @@ class _Bag:
     def findings(self) -> list[Finding]:
         found = [*self.damage]
         for path, problem in self.problems[:20]:
+            offset, lost = float(problem.offset), float(problem.end - problem.offset)
             if problem.loss is Loss.OPEN:
                 text = f"{path.name} was not closed: the recorder was stopped before it could finish."
-                found.append(note("integrity", text, offset=float(problem.offset)))
+                found.append(note("integrity", text, offset=offset))
             else:
                 text = f"{path.name}: bytes {problem.offset} to {problem.end} are lost, {problem.why}."
-                lost = float(problem.end - problem.offset)
-                found.append(note("integrity", text, Grade.DEGRADES, offset=float(problem.offset), bytes=lost))
+                found.append(note("integrity", text, Grade.DEGRADES, offset=offset, bytes=lost))
         for name, why in list(self.refused.items())[:20]:
             found.append(note("mapping", f"The topic {text_of(name)} is not read: {why}."))
         for name, number in self.large.items():
             found.append(note("mapping", f"{number} messages of {text_of(name)} are too large to hold signals."))
         return found
+
+
+def _name(topic: str) -> str:
+    return "/" + topic.strip("/")
 
 
 def _owner(topic: str) -> str:
@@ -244,5 +247,5 @@ def _user_mapping(file: str | None) -> BagMapping:
             raise FileFormatError(f'{file}: topics."{topic}".variables must be a list of names.')
         if len(set(names)) < len(names):
             raise FileFormatError(f'{file}: topics."{topic}".variables names a variable twice.')
-        variables["/" + topic.strip("/")] = tuple(names)
+        variables[_name(topic)] = tuple(names)
     return BagMapping(file, table.get("robot"), table.get("twist"), variables)

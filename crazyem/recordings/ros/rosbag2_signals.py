@@ -120,10 +120,10 @@ def recording_of(
     meaning = decide(tables, given=motor)
     firmware = signals_from_tables(tables, motor=meaning.meaning) if tables else {}
     named = {table.name for table in tables}
-    others = [_topic(d) for d in decoded if _label(d) not in named]
+    others = [(d, _topic(d)) for d in decoded if _label(d) not in named]
     mapped: list[Mapped] = []
     twist_notes: list[Finding] = []
-    for d, topic in [(d, t) for d in decoded for t in others if t.name == _label(d)]:
+    for d, topic in others:
         mapped += _meaning(d, topic, mapping, twist_notes)
     if any(d.rows.texts.get("child_frame_id") for d in decoded if d.topic.kind.name == _ODOMETRY) and any(
         d.topic.kind.name.startswith("crazyflie_interfaces/") for d in decoded
@@ -133,7 +133,7 @@ def recording_of(
     have = {*firmware, *(m.quantity for m in mapped if not m.origin)}
     # an external pose becomes the pose if there is no other
     mapped = [m if m.quantity in have else replace(m, origin="") for m in mapped]
-    rest, left_out = signals_of(others, mapped)
+    rest, left_out = signals_of([topic for _, topic in others], mapped)
     signals = _together(firmware, rest, {_label(d): d.order for d in decoded})
     about = {"robot": robot, "topics": " ".join(sorted(text_of(t.name) for t in topics))[:4000], **clocks}
     return Recording(
@@ -194,19 +194,17 @@ def _of_robot(rows: Rows, kind: str, robot: str) -> Rows:
     values: list[tuple[float, ...]] = []
     stamps: list[int] = []
     logs: list[int] = []
-    for i, message in enumerate(rows.objects):
-        for entry in message.transforms if kind == _TF else message.poses:
-            place, turn = (
-                (entry.transform.translation, entry.transform.rotation)
-                if kind == _TF
-                else (entry.pose.position, entry.pose.orientation)
-            )
-            if (entry.child_frame_id if kind == _TF else entry.name) != robot:
-                continue
-            stamp = entry.header.stamp if kind == _TF else message.header.stamp
+    for log, message in zip(rows.log.tolist(), rows.objects, strict=True):
+        if kind == _TF:
+            transforms = [(t, t.transform) for t in message.transforms if t.child_frame_id == robot]
+            poses = [(t.header.stamp, pose.translation, pose.rotation) for t, pose in transforms]
+        else:
+            own = [entry.pose for entry in message.poses if entry.name == robot]
+            poses = [(message.header.stamp, pose.position, pose.orientation) for pose in own]
+        for stamp, place, turn in poses:
             values.append((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
             stamps.append(stamp.sec * _NS + stamp.nanosec)
-            logs.append(int(rows.log[i]))
+            logs.append(log)
     table = np.array(values, float).reshape(-1, 7)
     names = [*(f"position.{c}" for c in _XYZ), *(f"orientation.{c}" for c in _XYZW)]
     columns = {name: table[:, i] for i, name in enumerate(names)}
