@@ -1,7 +1,6 @@
-"""ULog files made byte by byte here: exact values, frames against scipy, pyulog's own view, damage of every kind."""
+"""ULog files made byte by byte here: exact values, frames against scipy, damage of every kind."""
 
 import gzip
-import io
 import math
 import struct
 from collections.abc import Callable, Mapping
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pyulog import ULog
 from scipy.spatial.transform import Rotation
 
 from crazyem.errors import FileFormatError
@@ -152,32 +150,19 @@ def test_a_log_is_recognised_and_opened(tmp_path: Path) -> None:
 def test_vectors_and_attitudes_are_turned_to_flu_and_north_west_up(tmp_path: Path) -> None:
     content, truth = flight()
     signals = opened(tmp_path, content).signals
-    for name, columns in (("position", slice(0, 3)), ("velocity", slice(3, 6)), ("acceleration", slice(6, 9))):
-        expected = (FLIP @ single(truth["local"])[:, columns].T).T
-        np.testing.assert_array_equal(signals[name].value, expected)
-    np.testing.assert_array_equal(signals["body_rate"].value, single(truth["rate"]) @ FLIP)
-    np.testing.assert_array_equal(signals["body_rate@sensor_combined"].value, single(truth["imu"])[:, :3] @ FLIP)
-    np.testing.assert_array_equal(signals["specific_force"].value, single(truth["imu"])[:, 3:] @ FLIP)
-    np.testing.assert_array_equal(signals["setpoint_position"].value, single(truth["target"])[:, :3] @ FLIP)
-    np.testing.assert_array_equal(signals["setpoint_rate"].value, single(truth["rates"]) @ FLIP)
-    np.testing.assert_array_equal(signals["position@mocap"].value, single(truth["mocap"])[:, :3] @ FLIP)
-    ours = Rotation.from_quat(signals["attitude"].value).as_matrix()
-    theirs = Rotation.from_quat(single(truth["q"])[:, [1, 2, 3, 0]]).as_matrix()
-    np.testing.assert_allclose(ours, FLIP @ theirs @ FLIP, atol=1e-12)
-    angles = signals["setpoint_euler"].value
-    wanted = Rotation.from_quat(single(truth["q_d"])[:, [1, 2, 3, 0]]).as_matrix()
-    rebuilt = Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix()
-    np.testing.assert_allclose(rebuilt, FLIP @ wanted @ FLIP, atol=1e-6)
-
-
-def test_yaw_keeps_its_zero_and_turns_counter_clockwise(tmp_path: Path) -> None:
-    east = Rotation.from_euler("ZYX", [math.pi / 2, 0, 0]).as_quat()[[3, 0, 1, 2]]  # NED: yaw 90 degrees faces east
-    content = header() + definitions("vehicle_attitude")
-    content += data("vehicle_attitude", 10, 1, 0, 0, 0) + data("vehicle_attitude", 20, *east)
-    attitude = Rotation.from_quat(opened(tmp_path, content).signals["attitude"].value)
-    np.testing.assert_allclose(attitude[0].apply([1, 0, 0]), [1, 0, 0], atol=1e-7)  # north
-    np.testing.assert_allclose(attitude[1].apply([1, 0, 0]), [0, -1, 0], atol=1e-7)  # east is minus west
-    np.testing.assert_allclose(attitude[1].apply([0, 0, 1]), [0, 0, 1], atol=1e-7)
+    vectors = {
+        "position": truth["local"][:, :3], "velocity": truth["local"][:, 3:6], "acceleration": truth["local"][:, 6:],
+        "body_rate": truth["rate"], "body_rate@sensor_combined": truth["imu"][:, :3],
+        "specific_force": truth["imu"][:, 3:], "setpoint_position": truth["target"][:, :3],
+        "setpoint_rate": truth["rates"], "position@mocap": truth["mocap"][:, :3],
+    }  # fmt: skip
+    for name, expected in vectors.items():
+        np.testing.assert_array_equal(signals[name].value, single(expected) @ FLIP)
+    attitude = Rotation.from_quat(signals["attitude"].value)
+    setpoint = Rotation.from_euler("ZYX", signals["setpoint_euler"].value[:, ::-1])
+    for ours, key, tolerance in ((attitude, "q", 1e-12), (setpoint, "q_d", 1e-6)):
+        theirs = Rotation.from_quat(single(truth[key])[:, [1, 2, 3, 0]]).as_matrix()
+        np.testing.assert_allclose(ours.as_matrix(), FLIP @ theirs @ FLIP, atol=tolerance)
 
 
 def test_scalars_units_and_sources(tmp_path: Path) -> None:
@@ -229,15 +214,6 @@ def test_what_the_estimator_calls_invalid_is_missing_and_marked(tmp_path: Path) 
     assert signals["setpoint_position"].marked.tolist() == [True]
 
 
-def test_samples_come_in_the_order_of_their_times(tmp_path: Path) -> None:
-    content, _ = flight()
-    times = [s.time for s in opened(tmp_path, content).samples()]
-    assert len(times) == 40 * 10
-    assert times == sorted(times)
-    orders = np.concatenate([s.order for s in opened(tmp_path, content).signals.values()])
-    assert np.unique(orders).size == orders.size
-
-
 def test_instances_are_topics_of_their_own(tmp_path: Path) -> None:
     content = header() + text_format(f"battery_status:{FORMATS['battery_status']}")
     content += announce(1, "battery_status") + announce(2, "battery_status", 1)
@@ -245,31 +221,6 @@ def test_instances_are_topics_of_their_own(tmp_path: Path) -> None:
     signals = opened(tmp_path, content).signals
     assert signals["voltage"].value.tolist() == [[4.0]]
     assert signals["battery_status_1.voltage_v"].value.tolist() == [[3.5]]
-
-
-def test_the_same_numbers_as_pyulog(tmp_path: Path) -> None:
-    content, _ = flight(seed=5)
-    signals = opened(tmp_path, content).signals
-    log = ULog(io.BytesIO(content))
-    compared = 0
-    for dataset in log.data_list:
-        for name, column in dataset.data.items():
-            raw = signals.get(f"{dataset.name}.{name}")
-            if raw is not None:
-                np.testing.assert_array_equal(raw.value[:, 0], np.asarray(column, float))
-                compared += 1
-    assert compared > 30
-
-
-def test_what_pyulog_writes_is_read_the_same(tmp_path: Path) -> None:
-    content, _ = flight(seed=6)
-    again = io.BytesIO()
-    ULog(io.BytesIO(content)).write_ulog(again)
-    first, second = opened(tmp_path, content), opened(tmp_path, again.getvalue())
-    assert first.signals.keys() == second.signals.keys()
-    for name, signal in first.signals.items():
-        np.testing.assert_array_equal(signal.value, second.signals[name].value)
-        np.testing.assert_array_equal(signal.time, second.signals[name].time)
 
 
 def test_padding_at_the_end_of_a_message_does_no_harm(tmp_path: Path) -> None:
@@ -318,9 +269,9 @@ def test_truncation_at_any_byte(tmp_path: Path) -> None:
         content += data("vehicle_attitude", 1000 * i, 1, 0, i, 0) + data("battery_status", 1000 * i + 5, 4, i)
         content += data("esc_status", 1000 * i + 9, 4, *[i] * 24)
     whole = opened(tmp_path, content)
-    starts = {16}
-    while max(starts) < len(content):
-        starts.add(max(starts) + 3 + int.from_bytes(content[max(starts) : max(starts) + 2], "little"))
+    starts = [16]
+    while starts[-1] < len(content):
+        starts.append(starts[-1] + 3 + int.from_bytes(content[starts[-1] : starts[-1] + 2], "little"))
     near = {start + d for start in starts for d in (-1, 0, 1)} & set(range(len(content)))
     readable = 0
     for size in sorted({*range(0, len(content), 5), *near}):
@@ -333,31 +284,22 @@ def test_truncation_at_any_byte(tmp_path: Path) -> None:
             n = signal.time.size
             np.testing.assert_array_equal(signal.value, whole.signals[name].value[:n])
             np.testing.assert_array_equal(signal.time, whole.signals[name].time[:n])
-        cut = [f for f in part.findings if f.check == "integrity"]
-        assert len(cut) <= 1
-        if cut:  # it starts where the next message of the whole file starts
-            offset, count = int(cut[0].evidence["offset"]), int(cut[0].evidence["bytes"])
-            assert offset + count == size
-            assert offset in starts
-        else:
-            assert size in starts
+        cut = [f.evidence["offset"] for f in part.findings if f.check == "integrity"]
+        assert cut == ([] if size in starts else [max(start for start in starts if start <= size)])
     assert readable > 140  # from the first data message on
 
 
 def test_garbage_in_the_middle_costs_only_itself(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
-    first, second = b"", b""
-    for i in range(50):
-        first += data("battery_status", 1000 * i, 4, i)
-        second += data("battery_status", 1000 * (i + 50), 4, i + 50)
-    head = header() + definitions("battery_status")
+    messages = [data("battery_status", 1000 * i, 4, i) for i in range(100)]
+    first = header() + definitions("battery_status") + b"".join(messages[:50])
     for junk in (b"\xff" * 5000, bytes(5000), rng.bytes(20000), b"D" * 3001):
-        recording = opened(tmp_path, head + first + junk + second)
+        recording = opened(tmp_path, first + junk + b"".join(messages[50:]))
         amounts = recording.signals["battery_status.current_a"].value[:, 0]
         assert set(amounts) <= set(range(100))
         assert amounts.size >= 99  # what follows the junk is found again; at most one message is swallowed by it
         finding = next(f for f in recording.findings if f.check == "integrity")
-        assert abs(finding.evidence["offset"] - len(head + first)) <= 3
+        assert abs(finding.evidence["offset"] - len(first)) <= 3
 
 
 BOMBS = {

@@ -41,9 +41,7 @@ def quaternions(columns: Columns) -> NDArray[np.float64]:
     return np.column_stack([x, -y, -z, w])
 
 
-def euler(columns: Columns) -> NDArray[np.float64]:
-    """(n, 3) roll, pitch, yaw [rad] of FLU to NWU from roll, pitch, yaw of FRD to NED, both in order ZYX."""
-    return vectors(columns)
+euler = vectors  # also (n, 3) roll, pitch, yaw [rad] of FLU to NWU from those of FRD to NED, both in order ZYX
 
 
 def scaled(factor: float, turned: Turn = stacked) -> Turn:

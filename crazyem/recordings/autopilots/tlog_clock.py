@@ -1,8 +1,4 @@
-"""The clocks of a telemetry log on one time axis, and the messages that its link lost.
-
-The axis is the time since boot of the autopilot, or the time of arrival if no message has a time since boot. The
-sequence numbers of MAVLink show lost messages; a change of rate is not a loss.
-"""
+"""The clocks of a telemetry log on one time axis, and the messages that its link lost (by their sequence numbers)."""
 
 import itertools
 from collections import Counter

@@ -48,8 +48,6 @@ _SECOND = 1_000_000  # us
 # us; longest delay from a sample to its publication; with a longer one the stamp of the sample is not used
 _LONGEST_DELAY = 1 * _SECOND
 
-Data = Mapping[str, NDArray[np.generic]]
-
 
 def recognises(head: bytes) -> bool:
     """True if these first bytes are those of a ULog file."""
@@ -140,7 +138,7 @@ def _places(d: "ULog.Data", identifiers: NDArray[np.uint16]) -> NDArray[np.float
     return places if places.size == count else np.full(count, np.nan)
 
 
-def _stamps(data: Data) -> tuple[NDArray[np.uint64], str]:
+def _stamps(data: Mapping[str, NDArray[np.generic]]) -> tuple[NDArray[np.uint64], str]:
     """(n,) times of measurement [us], and their column.
 
     The column is `timestamp_sample` if it exists and is shortly before the publication, else `timestamp`.

@@ -16,20 +16,8 @@ from dataclasses import dataclass, field
 ULOG_MAGIC = b"ULog\x01\x12\x35"
 HEADER_BYTES = 16
 SYNC_BYTES = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
-TYPE_SIZES = {
-    "int8_t": 1,
-    "uint8_t": 1,
-    "int16_t": 2,
-    "uint16_t": 2,
-    "int32_t": 4,
-    "uint32_t": 4,
-    "int64_t": 8,
-    "uint64_t": 8,
-    "float": 4,
-    "double": 8,
-    "bool": 1,
-    "char": 1,
-}
+TYPE_SIZES = {f"{sign}int{bits}_t": bits // 8 for sign in ("", "u") for bits in (8, 16, 32, 64)}
+TYPE_SIZES |= {"float": 4, "double": 8, "bool": 1, "char": 1}
 _LARGEST_MESSAGE = 65535  # bytes; the size of a message has 16 bits
 _MOST_FIELDS = 200_000  # of all topics together
 _DEEPEST_NESTING = 8  # types within types
@@ -130,7 +118,8 @@ def scan(data: bytes) -> Scan:
     """Every sound message of a file that starts with `ULOG_MAGIC` and has its 16 bytes of header."""
     found = Scan(size=len(data))
     types = _Types()
-    whole, offsets = _appended(data)
+    flags, appended = _flags(data)
+    offsets = [offset for offset in appended if offset > HEADER_BYTES]
     view = memoryview(data)
     kept: list[memoryview | bytes] = []  # runs of sound messages before `start`
     position, start, size = HEADER_BYTES, HEADER_BYTES, len(data)
@@ -140,43 +129,36 @@ def scan(data: bytes) -> Scan:
     topics = types.topics
     record = found.identifiers.append
     while position < size:
-        sound = False
         if position >= limit:
             limit = min((o for o in offsets if position < o < size), default=size)
-        if position + 3 <= limit:
-            length, kind = unpack(data, position)
-            after = position + 3 + length
-            if after <= limit:
-                if kind == 0x44 and length > 2:  # 'D', nearly all of a file
-                    identifier = two(data, position + 3)[0]
-                    limits = topics.get(identifier)
-                    sound = limits is not None and length - 2 == limits[0]
-                    if sound:
-                        record(identifier)
-                    elif limits is not None and limits[0] < length - 2 <= limits[1]:
-                        record(identifier)
-                        found.messages += 1
-                        kept += [view[start:position], _without_padding(data, position, limits[0])]
-                        start = position = after
-                        continue
-                if not sound:
-                    sound, keep = _check(data, position, length, kind, types, found)
-                    if sound and not keep:  # not passed to pyulog
-                        found.messages += 1
-                        kept.append(view[start:position])
-                        start = position = after
-                        continue
-        if sound:
-            found.messages += 1
-            position = after
+        length, kind = unpack(data, position) if position + 3 <= limit else (size, 0)
+        after = position + 3 + length
+        data_message = kind == 0x44 and length > 2 and after <= limit  # 'D', nearly all of a file
+        identifier = two(data, position + 3)[0] if data_message else -1
+        limits = topics.get(identifier)
+        sound, replacement = after <= limit, None  # None: pyulog gets the message as it is
+        if limits is not None and limits[0] <= length - 2 <= limits[1]:
+            record(identifier)
+            if length - 2 > limits[0]:
+                replacement = _without_padding(data, position, limits[0])
+        elif sound:
+            sound, keep = _check(data, position, length, kind, types, found)
+            replacement = None if keep else b""
+        if not sound:
+            kept.append(view[start:position])
+            again = _resume(data, position, limit, types)
+            found.skipped.append((position, again - position))
+            start = position = again
             continue
-        kept.append(view[start:position])
-        again = _resume(data, position, limit, types)
-        found.skipped.append((position, again - position))
-        start = position = again
+        found.messages += 1
+        if replacement is not None:
+            kept += [view[start:position], replacement]
+            start = after
+        position = after
     kept.append(view[start:size])
     header = data[:7] + b"\x01" + data[8:HEADER_BYTES]  # without the mark of appended data
-    found.data = data if whole and len(kept) == 1 else b"".join([header, *kept])
+    whole = len(kept) == 1 and not any(flags) and not any(appended)
+    found.data = data if whole else b"".join([header, *kept])
     return found
 
 
@@ -187,11 +169,11 @@ def _without_padding(data: bytes, at: int, size: int) -> bytes:
 
 def _check(data: bytes, at: int, length: int, kind: int, types: _Types, found: Scan) -> tuple[bool, bool]:
     """Whether another message is sound, and whether to pass it to pyulog; stores formats and topics."""
-    body = data[at + 3 : at + 3 + length]
-    if kind == 0x44:
-        return length > 2 and int.from_bytes(body[:2], "little") in types.refused_ids, False
-    if not _plausible(body, kind, at):
+    if not _sound(data, at, length, kind, types):
         return False, False
+    if kind == 0x44:
+        return True, False  # data of a refused topic
+    body = data[at + 3 : at + 3 + length]
     if kind == 0x46:  # 'F'
         if types.names:
             return True, False  # too late: formats must come before topics
@@ -245,50 +227,43 @@ def _key_value(body: bytes) -> bool:
 
 def _resume(data: bytes, damaged: int, limit: int, types: _Types) -> int:
     """Offset of the next consecutive sound messages after `damaged`; `limit` if there are none."""
-    for match in _CANDIDATE.finditer(data, damaged + 2, limit):
-        start = match.start() - 1
-        position = start
-        for _ in range(_SOUND_MESSAGES):
-            if position == limit:
-                break
-            if position + 3 > limit:
-                position = -1
-                break
-            length, kind = struct.unpack_from("<HB", data, position)
-            if position + 3 + length > limit or not _sound(data, position, length, kind, types):
-                position = -1
-                break
-            position += 3 + length
-        if position > 0:
-            return start
-    return limit
+    starts = (match.start() - 1 for match in _CANDIDATE.finditer(data, damaged + 2, limit))
+    return next((start for start in starts if _sound_run(data, start, limit, types)), limit)
+
+
+def _sound_run(data: bytes, position: int, limit: int, types: _Types) -> bool:
+    """Whether `_SOUND_MESSAGES` sound messages, or fewer up to `limit`, follow each other at `position`."""
+    for _ in range(_SOUND_MESSAGES):
+        if position == limit:
+            return True
+        if position + 3 > limit:
+            return False
+        length, kind = struct.unpack_from("<HB", data, position)
+        short = kind == 0x44 or length <= 8192
+        if position + 3 + length > limit or not short or not _sound(data, position, length, kind, types):
+            return False
+        position += 3 + length
+    return True
 
 
 def _sound(data: bytes, at: int, length: int, kind: int, types: _Types) -> bool:
-    """As `_check`, without storing anything."""
-    if kind == 0x44:
-        if length <= 2:
-            return False
-        identifier = int.from_bytes(data[at + 3 : at + 5], "little")
-        limits = types.topics.get(identifier)
-        return identifier in types.refused_ids or (limits is not None and limits[0] <= length - 2 <= limits[1])
-    if kind not in _MESSAGE_TYPES or length > 8192:
-        return False
-    return _plausible(data[at + 3 : at + 3 + length], kind, at)
+    """Whether a message fits its type, and a data message its topic."""
+    body = data[at + 3 : at + 3 + length]
+    if kind != 0x44:
+        return _plausible(body, kind, at)
+    identifier = int.from_bytes(body[:2], "little")
+    least, most = types.topics.get(identifier, (1, 0))
+    return length > 2 and (identifier in types.refused_ids or least <= length - 2 <= most)
 
 
-def _appended(data: bytes) -> tuple[bool, tuple[int, ...]]:
-    """Whether the header can stay unchanged, and the offsets of appended data."""
+def _flags(data: bytes) -> tuple[bytes, tuple[int, ...]]:
+    """The incompatible flags and the offsets of appended data; zeros in a file without the message of flags."""
     if data[HEADER_BYTES + 2 : HEADER_BYTES + 3] != b"B" or len(data) < HEADER_BYTES + 43:
-        return True, ()
-    flags = data[HEADER_BYTES + 11 : HEADER_BYTES + 19]
-    offsets = struct.unpack_from("<3Q", data, HEADER_BYTES + 19)
-    return not any(flags) and not any(offsets), tuple(o for o in offsets if o > HEADER_BYTES)
+        return bytes(8), ()
+    return data[HEADER_BYTES + 11 : HEADER_BYTES + 19], struct.unpack_from("<3Q", data, HEADER_BYTES + 19)
 
 
 def unknown_flags(data: bytes) -> bool:
     """True if the file has incompatible flags that this reader does not know."""
-    if data[HEADER_BYTES + 2 : HEADER_BYTES + 3] != b"B" or len(data) < HEADER_BYTES + 43:
-        return False
-    flags = data[HEADER_BYTES + 11 : HEADER_BYTES + 19]
+    flags, _ = _flags(data)
     return bool(flags[0] & ~1) or any(flags[1:])
