@@ -5,7 +5,6 @@ summary and begins where the data end. A crash at any moment leaves a file that 
 readers here accept. The first write of the new session is the first change of the file.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,27 +18,7 @@ from crazyem.recordings.mcap.schemas import session_of
 from crazyem.recordings.mcap.survey import Part, index_of, parse, parts, profile_of
 
 
-@dataclass
-class Continued:
-    """A recording to continue.
-
-    Attributes:
-        stream: positioned after the last complete record. offset: place of the next record [bytes].
-        book: contents of the file so far.
-        sequence: number of the last message.
-        log_time: the latest log time [ns].
-        sessions: number of sessions in the file.
-    """
-
-    stream: Any
-    offset: int
-    book: Book
-    sequence: int
-    log_time: int
-    sessions: int
-
-
-def reopen(path: Path) -> Continued:
+def reopen(path: Path) -> "Continued":
     """Open a finished or cut-off recording of crazyem to continue it.
 
     Raises: FileFormatError for a file of another program, an imported recording, or damage before the end; OSError.
@@ -48,7 +27,7 @@ def reopen(path: Path) -> Continued:
         if profile_of(head.read(4096)) != PROFILE:
             raise FileFormatError(f"{path} is not a recording of crazyem and cannot be continued.")
     problems: list[Problem] = []
-    found = _Found(Book(), len(MCAP_MAGIC))
+    found = Continued()
     for part in parts(path, problems):
         if part.record.opcode == DATA_END:
             break
@@ -59,28 +38,42 @@ def reopen(path: Path) -> Continued:
     if any(channel.topic.startswith("/signals/") for channel in found.book.channels.values()):
         raise FileFormatError(f"{path} is an imported recording, to which no flight can be added.")
     missing = found.close_chunk()
-    stream = _Tail(path, found.end, missing)
-    log_time = min(found.book.end or 0, 2**63 - 1)
-    return Continued(stream, found.end + len(missing), found.book, found.sequence, log_time, found.sessions)
+    found.stream = _Tail(path, found.offset, missing)
+    found.offset += len(missing)
+    return found
 
 
-class _Found:
-    """The book of a file, rebuilt from its records."""
+class Continued:
+    """A recording to continue, rebuilt from its records.
 
-    def __init__(self, book: Book, end: int) -> None:
-        self.book, self.end = book, end
+    Attributes:
+        stream: positioned after the last complete record. offset: place of the next record [bytes].
+        book: contents of the file so far.
+        sequence: number of the last message.
+        sessions: number of sessions in the file.
+    """
+
+    def __init__(self) -> None:
+        self.stream: Any = None
+        self.book, self.offset = Book(), len(MCAP_MAGIC)
         self.sequence, self.sessions = 0, 1
         self._chunk: Part | None = None
         self._indexes: dict[int, bytes] = {}
 
+    @property
+    def log_time(self) -> int:
+        """The latest log time [ns]."""
+        return min(self.book.end or 0, 2**63 - 1)
+
     def take(self, part: Part) -> None:
+        """The next part of the file."""
         record = part.record
         if record.opcode == MESSAGE_INDEX:
             channel = int.from_bytes(record.data[:2], "little")
             self._indexes[channel] = HEAD.pack(record.opcode, len(record.data)) + record.data
         else:
             self.close_chunk()
-        self.end = record.end
+        self.offset = record.end
         for entry in part.announced:
             self.book.announce(entry)
             if isinstance(entry, Channel):
@@ -107,7 +100,7 @@ class _Found:
         if indexes.keys() != index.keys():
             indexes = {channel: index_record(channel, pairs) for channel, pairs in index.items()}
             missing = b"".join(indexes.values())
-            self.end = record.end
+            self.offset = record.end
         note_chunk(
             self.book, record.offset, record.end - record.offset, chunk.compression, len(chunk.packed), chunk.size,
             index, indexes,
