@@ -72,9 +72,8 @@ def parser() -> argparse.ArgumentParser:
     fly.add_argument("--append", action="store_true", help="to an existing recording, as its next session")
     fly.add_argument("--scenario", metavar="FILE", help="the simulator's truth (only the simulator reads it)")
     fly.add_argument("--seed", type=_integer(0, 2**31 - 1), help="of the simulator's noise (default: 0)")
-    fly.add_argument(
-        "--speed", type=_number(0.05, 100), metavar="X", help="of the simulator, times real time (default: 1)"
-    )
+    text = "of the simulator, times real time (default: 1)"
+    fly.add_argument("--speed", type=_number(0.05, 100), metavar="X", help=text)
     _monitor(fly, None)
     _logging(fly, reconnect=8.0)
     _many(fly)
@@ -103,16 +102,13 @@ def parser() -> argparse.ArgumentParser:
 
 def _flying(p: argparse.ArgumentParser) -> None:
     """Options for the trajectory of a flight."""
-    p.add_argument(
-        "--trajectory", nargs="+", default=["hover"], metavar="NAME",
-        help="hover, figure8, excite, informative, waypoints FILE, or plan FILE",
-    )  # fmt: skip
-    p.add_argument(
-        "--goal", type=_number(0.1, 100, " percent"), default=5.0, metavar="PERCENT",
-        help="of informative: ends when mass, Ixx, Iyy and Izz are known within this (95 %%; default: 5)",
-    )  # fmt: skip
+    add = p.add_argument
+    text = "hover, figure8, excite, informative, waypoints FILE, or plan FILE"
+    add("--trajectory", nargs="+", default=["hover"], metavar="NAME", help=text)
+    text = "of informative: ends when mass, Ixx, Iyy and Izz are known within this (95 %%; default: 5)"
+    add("--goal", type=_number(0.1, 100, " percent"), default=5.0, metavar="PERCENT", help=text)
     seconds = _number(1, 3600, " seconds")
-    p.add_argument("--duration", type=seconds, default=20.0, metavar="S", help="of the trajectory (default: 20)")
+    add("--duration", type=seconds, default=20.0, metavar="S", help="of the trajectory (default: 20)")
 
 
 def _pushing(p: argparse.ArgumentParser, push: str) -> None:
@@ -135,39 +131,33 @@ def _monitor(p: argparse.ArgumentParser, default: bool | None) -> None:
 def _logging(p: argparse.ArgumentParser, *, reconnect: float) -> None:
     """Options of a session's link."""
     hertz, seconds = _number(1, 1000, " Hz"), _number(0, 3600, " seconds")
-    p.add_argument(
-        "--rate", type=hertz, default=1000.0 / 11.0, metavar="HZ",
-        help="of the log, to 1000 (default: every 11 ms, no multiple of the onboard estimate's 10)",
-    )  # fmt: skip
-    p.add_argument(
-        "--reconnect", type=seconds, default=reconnect, metavar="S",
-        help=f"how long a lost link is tried again; 0: never (default: {reconnect:g})",
-    )  # fmt: skip
+    text = "of the log, to 1000 (default: every 11 ms, no multiple of the onboard estimate's 10)"
+    p.add_argument("--rate", type=hertz, default=1000.0 / 11.0, metavar="HZ", help=text)
+    text = f"how long a lost link is tried again; 0: never (default: {reconnect:g})"
+    p.add_argument("--reconnect", type=seconds, default=reconnect, metavar="S", help=text)
 
 
 def _many(p: argparse.ArgumentParser) -> None:
     """Options for several drones, and for their display."""
-    p.add_argument("--uri", action="append", default=[], dest="uris", metavar="URI", help="one more drone (repeatable)")
-    p.add_argument("--swarm", metavar="FILE.toml", help="drones with uri, vehicle, trajectory and offset each")
+    add = p.add_argument
+    add("--uri", action="append", default=[], dest="uris", metavar="URI", help="one more drone (repeatable)")
+    add("--swarm", metavar="FILE.toml", help="drones with uri, vehicle, trajectory and offset each")
     shown = p.add_mutually_exclusive_group()
     shown.add_argument("--live", action="store_true", help="a live view, also where output goes to a file")
     shown.add_argument("--no-live", action="store_true", help="plain lines (default where there is no terminal)")
-    p.add_argument(
-        "--foxglove", nargs="?", type=_integer(1, 65535), const=8765, metavar="PORT",
-        help="stream to Foxglove on this host while it runs (default port: 8765)",
-    )  # fmt: skip
+    text = "stream to Foxglove on this host while it runs (default port: 8765)"
+    add("--foxglove", nargs="?", type=_integer(1, 65535), const=8765, metavar="PORT", help=text)
 
 
 def _links(commands: Any) -> None:
     """The commands for links to drones."""
     text = "what a drone could be reached through here: radio, USB, UDP, serial; and what is missing"
     p = commands.add_parser("links", help=text, description=text)
-    p.add_argument("--host", default="127.0.0.1", metavar="HOST", help="asked for drones on UDP (default: this one)")
-    p.add_argument(
-        "--ports", nargs="+", type=_integer(1, 65535), metavar="PORT", help="of UDP (default: 19850 to 19859)"
-    )
-    p.add_argument("--no-air", action="store_true", help="do not search the air for drones, which takes some seconds")
-    p.add_argument("--json", nargs="?", const="-", metavar="FILE", help="for programs; without FILE on standard output")
+    add = p.add_argument
+    add("--host", default="127.0.0.1", metavar="HOST", help="asked for drones on UDP (default: this one)")
+    add("--ports", nargs="+", type=_integer(1, 65535), metavar="PORT", help="of UDP (default: 19850 to 19859)")
+    add("--no-air", action="store_true", help="do not search the air for drones, which takes some seconds")
+    add("--json", nargs="?", const="-", metavar="FILE", help="for programs; without FILE on standard output")
 
 
 def _policy(commands: Any) -> None:
@@ -182,35 +172,26 @@ def _paper(commands: Any) -> None:
     """The command that reproduces Zhao's paper."""
     text = "the paper's simulations again: its method, ours and the information limit, as tables and figures"
     p = commands.add_parser("paper", help=text, description=text)
-    p.add_argument("--experiment", choices=("all", "table1", "offline", "online"), default="all")
-    p.add_argument("--sensor", choices=("A", "B", "C", "all"), default="all")
-    p.add_argument("--method", choices=("published", "crazyem", "both"), default="both")
-    p.add_argument("--seeds", type=_integer(1, 10_000), default=20, metavar="N", help="flights of each (default: 20)")
-    p.add_argument("--jobs", type=_integer(1, 1024), metavar="N", help="processes (default: one a core)")
-    p.add_argument("--cluster", metavar="ADDRESS", help="work on a Dask cluster: address of its scheduler")
-    p.add_argument(
-        "--out", default="paper", metavar="DIR", help="output, and where a stopped run goes on (default: paper)"
-    )
-    p.add_argument(
-        "--reading", choices=("p5", "literal"), default="p5", help="of what the paper leaves unsaid (default: p5)"
-    )
-    p.add_argument(
-        "--set", action="append", metavar="NAME=VALUE", help="change a setting of the simulation (repeatable)"
-    )
-    p.add_argument("--settings", action="store_true", help="list the settings with their reasons, and run nothing")
+    add = p.add_argument
+    add("--experiment", choices=("all", "table1", "offline", "online"), default="all")
+    add("--sensor", choices=("A", "B", "C", "all"), default="all")
+    add("--method", choices=("published", "crazyem", "both"), default="both")
+    add("--seeds", type=_integer(1, 10_000), default=20, metavar="N", help="flights of each (default: 20)")
+    add("--jobs", type=_integer(1, 1024), metavar="N", help="processes (default: one a core)")
+    add("--cluster", metavar="ADDRESS", help="work on a Dask cluster: address of its scheduler")
+    add("--out", default="paper", metavar="DIR", help="output, and where a stopped run goes on (default: paper)")
+    add("--reading", choices=("p5", "literal"), default="p5", help="of what the paper leaves unsaid (default: p5)")
+    add("--set", action="append", metavar="NAME=VALUE", help="change a setting of the simulation (repeatable)")
+    add("--settings", action="store_true", help="list the settings with their reasons, and run nothing")
 
 
 def _reading(p: argparse.ArgumentParser) -> None:
     """Options for the reader of a recording (`crazyem.recordings.contents`)."""
-    p.add_argument("--map", metavar="FILE.toml", help="which columns of a CSV are which signals: a file or a preset")
-    p.add_argument(
-        "--motor",
-        choices=("duty", "request"),
-        help="what motor.m1..4 of an old log is: the duty sent, or the thrust requested before compensation",
-    )
-    p.add_argument(
-        "--as-published", action="store_true", help="believe a preset's publisher instead of correcting known mistakes"
-    )
+    add = p.add_argument
+    add("--map", metavar="FILE.toml", help="which columns of a CSV are which signals: a file or a preset")
+    text = "what motor.m1..4 of an old log is: the duty sent, or the thrust requested before compensation"
+    add("--motor", choices=("duty", "request"), help=text)
+    add("--as-published", action="store_true", help="believe a preset's publisher instead of correcting known mistakes")
 
 
 def _cutting(p: argparse.ArgumentParser) -> None:
@@ -225,24 +206,21 @@ def _diagnose(commands: Any) -> None:
     """The command `diagnose`."""
     text = "where a vehicle's model and its flights part, which physics was left out, and the model with it"
     p = commands.add_parser("diagnose", help=text, description=text)
-    p.add_argument("files", nargs="+", metavar="RECORDING", help="flights of one drone")
-    p.add_argument("--vehicle", metavar="NAME|FILE", help="the nominal model (default: the one that was flown)")
-    p.add_argument("--against", metavar="SIMULATED", help="a simulated recording of the same mission, to look at first")
+    add = p.add_argument
+    add("files", nargs="+", metavar="RECORDING", help="flights of one drone")
+    add("--vehicle", metavar="NAME|FILE", help="the nominal model (default: the one that was flown)")
+    add("--against", metavar="SIMULATED", help="a simulated recording of the same mission, to look at first")
     several: dict[str, Any] = {"nargs": "+", "action": "extend", "default": [], "metavar": "RECORDING"}
-    p.add_argument("--held-out", **several, help="flights only to judge by, unless only they move (--strict-held-out)")
-    p.add_argument("--baseline", **several, help="flights of the healthy drone: its own trim, and how its days differ")
-    p.add_argument(
-        "--strict-held-out", action="store_true", help="fit nothing to these even where the others only hover"
-    )
-    p.add_argument(
-        "--withhold", action="append", default=[], metavar="SIGNAL", help="a signal to leave unused, e.g. pm.vbat"
-    )
-    p.add_argument("--method", choices=("stages", "posterior"), help=argparse.SUPPRESS)
-    p.add_argument("--candidates", metavar="A,B,...", help="effects to look for (default: the whole catalogue)")
-    p.add_argument("--jobs", type=_integer(1, 64), metavar="N", help="threads (default: one a core)")
-    p.add_argument("--report", metavar="OUT.html", help="one self-contained page")
-    p.add_argument("--json", metavar="OUT.json", help="the diagnosis for programs; - for standard output")
-    p.add_argument("--write-vehicle", metavar="FITTED.toml", help="the vehicle with what was found")
+    add("--held-out", **several, help="flights only to judge by, unless only they move (--strict-held-out)")
+    add("--baseline", **several, help="flights of the healthy drone: its own trim, and how its days differ")
+    add("--strict-held-out", action="store_true", help="fit nothing to these even where the others only hover")
+    add("--withhold", action="append", default=[], metavar="SIGNAL", help="a signal to leave unused, e.g. pm.vbat")
+    add("--method", choices=("stages", "posterior"), help=argparse.SUPPRESS)
+    add("--candidates", metavar="A,B,...", help="effects to look for (default: the whole catalogue)")
+    add("--jobs", type=_integer(1, 64), metavar="N", help="threads (default: one a core)")
+    add("--report", metavar="OUT.html", help="one self-contained page")
+    add("--json", metavar="OUT.json", help="the diagnosis for programs; - for standard output")
+    add("--write-vehicle", metavar="FITTED.toml", help="the vehicle with what was found")
     _reading(p)
     _cutting(p)
 
@@ -251,50 +229,42 @@ def _plan(commands: Any) -> None:
     """The command `plan` for experiments."""
     text = "the manoeuvre that most narrows intervals, or best tells two explanations apart; and what to expect of it"
     p = commands.add_parser("plan", help=text, description=text)
+    add = p.add_argument
     goal = p.add_mutually_exclusive_group()
     goal.add_argument("--for", dest="parameters", metavar="A,...", help="to be narrowed (default: mass,Ixx,Iyy,Izz)")
     goal.add_argument("--split", metavar="EFFECT,EFFECT", help="effects to tell apart")
     goal.add_argument("--from", dest="diagnosis", metavar="DIAGNOSIS.json", help="tell its look-alikes apart")
-    p.add_argument("--vehicle", default="cf2", metavar="NAME|FILE", help="preset or vehicle file (default: cf2)")
-    p.add_argument(
-        "--box", type=_number(0.1, 20, " m"), nargs=3, default=(1.0, 1.0, 0.6), metavar=("X", "Y", "Z"),
-        help="full widths in m about the hover point (default: 1 1 0.6)",
-    )  # fmt: skip
-    p.add_argument("--tilt", type=_number(2, 45, " degrees"), default=20.0, metavar="DEG", help="at most (default: 20)")
-    p.add_argument("--time", type=_number(3, 300, " seconds"), default=10.0, metavar="S", help="(default: 10)")
-    p.add_argument(
-        "--criterion", choices=("D", "A"), default="D",
-        help="of --for: volume of the joint interval, or sum of relative variances (default: D)",
-    )  # fmt: skip
-    p.add_argument("--noise", metavar="FLIGHT.json", help="expect the noise of this flight or replay of the drone")
-    p.add_argument("--seed", type=_integer(0, 2**31 - 1), default=0, help="of the search (default: 0)")
-    p.add_argument("--json", nargs="?", const="-", metavar="FILE", help="for programs; without FILE on standard output")
-    p.add_argument("-o", "--output", required=True, metavar="PLAN.toml", help="for crazyem fly --trajectory plan")
+    add("--vehicle", default="cf2", metavar="NAME|FILE", help="preset or vehicle file (default: cf2)")
+    text = "full widths in m about the hover point (default: 1 1 0.6)"
+    add("--box", type=_number(0.1, 20, " m"), nargs=3, default=(1.0, 1.0, 0.6), metavar=("X", "Y", "Z"), help=text)
+    add("--tilt", type=_number(2, 45, " degrees"), default=20.0, metavar="DEG", help="at most (default: 20)")
+    add("--time", type=_number(3, 300, " seconds"), default=10.0, metavar="S", help="(default: 10)")
+    text = "of --for: volume of the joint interval, or sum of relative variances (default: D)"
+    add("--criterion", choices=("D", "A"), default="D", help=text)
+    add("--noise", metavar="FLIGHT.json", help="expect the noise of this flight or replay of the drone")
+    add("--seed", type=_integer(0, 2**31 - 1), default=0, help="of the search (default: 0)")
+    add("--json", nargs="?", const="-", metavar="FILE", help="for programs; without FILE on standard output")
+    add("-o", "--output", required=True, metavar="PLAN.toml", help="for crazyem fly --trajectory plan")
 
 
 def _predict(commands: Any) -> None:
     """The command `predict`: open-loop predictions for the user's own metric."""
     text = "where a vehicle goes by its model: open-loop predictions from every recorded state, by recorded inputs"
     p = commands.add_parser("predict", help=text, description=text)
-    p.add_argument("file", metavar="RECORDING", help="a recording of any known format")
-    p.add_argument("--vehicle", metavar="NAME|FILE", help="preset or vehicle file (default: the one that was flown)")
-    p.add_argument("--horizon", type=_integer(1, 1_000_000), required=True, metavar="N", help="steps from each start")
+    add = p.add_argument
+    add("file", metavar="RECORDING", help="a recording of any known format")
+    add("--vehicle", metavar="NAME|FILE", help="preset or vehicle file (default: the one that was flown)")
+    add("--horizon", type=_integer(1, 1_000_000), required=True, metavar="N", help="steps from each start")
     step = _number(1e-4, 10, " seconds")
-    p.add_argument("--step", type=step, metavar="S", help="s between predicted states (default: the recorded samples)")
-    p.add_argument(
-        "--every", type=_integer(1, 1_000_000), default=1, metavar="K", help="samples from start to start (default: 1)"
-    )
-    p.add_argument("--plain", action="store_true", help="the model alone, however wrong its turning was before a start")
-    p.add_argument(
-        "--ensemble", type=_integer(2, 10_000), metavar="N", help="a band by N drones of the vehicle's [posterior]"
-    )
-    p.add_argument("--seed", type=_integer(0, 2**31 - 1), default=0, help="of --ensemble (default: 0)")
-    p.add_argument("--other-day", action="store_true", help="of --ensemble: thrust, trim and lag of another day")
-    p.add_argument(
-        "--calibrate", nargs="+", default=[], metavar="RECORDING", help="other flights, to learn disturbances from"
-    )
-    p.add_argument("-o", "--output", required=True, metavar="OUT.npz", help="array `prediction`, and which starts")
-    p.add_argument("--force", action="store_true", help="replace what is there (never a recording that is read)")
+    add("--step", type=step, metavar="S", help="s between predicted states (default: the recorded samples)")
+    add("--every", type=_integer(1, 1_000_000), default=1, metavar="K", help="samples from start to start (default: 1)")
+    add("--plain", action="store_true", help="the model alone, however wrong its turning was before a start")
+    add("--ensemble", type=_integer(2, 10_000), metavar="N", help="a band by N drones of the vehicle's [posterior]")
+    add("--seed", type=_integer(0, 2**31 - 1), default=0, help="of --ensemble (default: 0)")
+    add("--other-day", action="store_true", help="of --ensemble: thrust, trim and lag of another day")
+    add("--calibrate", nargs="+", default=[], metavar="RECORDING", help="other flights, to learn disturbances from")
+    add("-o", "--output", required=True, metavar="OUT.npz", help="array `prediction`, and which starts")
+    add("--force", action="store_true", help="replace what is there (never a recording that is read)")
     _reading(p)
     _cutting(p)
 
@@ -325,16 +295,14 @@ def _vehicle(commands: Any) -> None:
     check = action("check", "what is wrong in a simulator's file, by flights: in its own names and units")
     check.add_argument("file", metavar="FILE", help="of a known simulator")
     check.add_argument("files", nargs="+", metavar="RECORDING", help="flights of that drone")
-    check.add_argument(
-        "--held-out", nargs="+", action="extend", default=[], metavar="RECORDING", help="flights only to judge by"
-    )
+    text = "flights only to judge by"
+    check.add_argument("--held-out", nargs="+", action="extend", default=[], metavar="RECORDING", help=text)
     check.add_argument("--beside", nargs="+", default=[], metavar="FILE", help="files that should say the same")
     check.add_argument("--vehicle", metavar="NAME|FILE", help="what the file does not say (default: what was flown)")
     check.add_argument("--mass", type=_number(1e-3, 100, " kg"), metavar="KG", help="of the whole drone, weighed")
     check.add_argument("--candidates", metavar="A,B,...", help="effects to look for (default: the whole catalogue)")
-    check.add_argument(
-        "--tolerance", type=_number(0, 1), default=0.05, metavar="X", help="relative, of a number that may stay (0.05)"
-    )
+    text = "relative, of a number that may stay (0.05)"
+    check.add_argument("--tolerance", type=_number(0, 1), default=0.05, metavar="X", help=text)
     check.add_argument("--write", metavar="TARGET", help="the file, corrected")
     check.add_argument("--strict", action="store_true", help="exit code 5 if the file does not fit")
     check.add_argument("--jobs", type=_integer(1, 64), metavar="N", help="threads (default: one a core)")
@@ -349,12 +317,8 @@ def _vehicle(commands: Any) -> None:
     sample.add_argument("--to", metavar="FORMAT", help="of the files in DIR (default: vehicle files)")
     sample.add_argument("--template", metavar="FILE", help="a file of yours, of which all that is not ours stays")
     sample.add_argument("--same-day", action="store_true", help="without the spread from one day to the next")
-    sample.add_argument(
-        "--mass-sd",
-        type=_number(0, 1),
-        metavar="X",
-        help="relative, of the mass, which no flight tells (default: 0.02)",
-    )
+    text = "relative, of the mass, which no flight tells (default: 0.02)"
+    sample.add_argument("--mass-sd", type=_number(0, 1), metavar="X", help=text)
 
 
 def _on_recordings(commands: Any) -> None:
@@ -365,13 +329,11 @@ def _on_recordings(commands: Any) -> None:
         if many:
             p.add_argument("files", nargs="+", metavar="FILE", help="recordings, folders of them, or quoted patterns")
             _reading(p)
-            p.add_argument(
-                "--jobs", type=_integer(1, 1024), metavar="N", help="processes (default: one a core, one for one file)"
-            )
+            text = "processes (default: one a core, one for one file)"
+            p.add_argument("--jobs", type=_integer(1, 1024), metavar="N", help=text)
             p.add_argument("--cluster", metavar="ADDRESS", help="work on a Dask cluster: address of its scheduler")
-        p.add_argument(
-            "--json", nargs="?", const="-", metavar="FILE", help="results for programs; without FILE on standard output"
-        )
+        text = "results for programs; without FILE on standard output"
+        p.add_argument("--json", nargs="?", const="-", metavar="FILE", help=text)
         return p
 
     def writes(p: argparse.ArgumentParser, metavar: str, text: str, *, required: bool = True) -> None:
