@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from crazyem.api.inputs import RecordingLike, VehicleLike, recording_of, vehicle_of
+from crazyem.api.inputs import RecordingLike, VehicleLike, recording_of, recordings_of, vehicle_of
 from crazyem.api.planning import plan_commands
 from crazyem.deprecated import warn
 from crazyem.diagnosis import diagnose as by_recordings
@@ -163,12 +163,11 @@ def diagnose(
         DataError: a recording cannot be used (no flight, no inputs, too short).
     """
     say = progress or (lambda text: None)
-    flown = [recording_of(r, options) for r in _several(recordings)]
-    kept = [recording_of(r, options) for r in _several(held_out)]
+    flown, kept = recordings_of(recordings, options), recordings_of(held_out, options)
     if not flown:
         raise UsageError("a diagnosis needs at least one recording.")
     nominal = vehicle_of(vehicle, flown[0])
-    if healthy := [recording_of(r, options) for r in _several(baseline)]:
+    if healthy := recordings_of(baseline, options):
         nominal = with_baseline(nominal, healthy, say)
     if method:
         warn("diagnose(method=...)", "diagnose, which has one method")
@@ -193,7 +192,3 @@ def _with_plans(
     values = {f.name: getattr(found, f.name) for f in fields(found)}
     values["would_separate"] = (*found.would_separate, *plans)
     return Diagnosis(**values, document=document, pictures=pictures)
-
-
-def _several(given: RecordingLike | Sequence[RecordingLike]) -> Sequence[RecordingLike]:
-    return given if isinstance(given, Sequence) and not isinstance(given, str) else [given]

@@ -1,5 +1,6 @@
 """Arguments of the API functions: recordings and vehicles, as objects or as names and paths."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from crazyem.physics import folding
@@ -16,6 +17,14 @@ VehicleLike = Vehicle | str | Path
 def recording_of(given: RecordingLike, options: ReadOptions | None = None) -> Recording:
     """The given recording, or the recording at a path. Raises as `open_recording`."""
     return given if isinstance(given, Recording) else open_recording(given, options)
+
+
+def recordings_of(
+    given: RecordingLike | Sequence[RecordingLike], options: ReadOptions | None = None
+) -> list[Recording]:
+    """One recording or several, as `recording_of`."""
+    several = given if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+    return [recording_of(one, options) for one in several]
 
 
 def vehicle_of(given: VehicleLike | None, recording: Recording | None = None) -> Vehicle:

@@ -96,7 +96,8 @@ def _feed(pipeline: Pipeline, recording: Recording, progress: Progress | None) -
 
 def _notices(recording: Recording, findings: list[Finding], left_out: str, weight: str) -> list[str]:
     said = [f"the doctor says ({f.grade}): {f.text}" for f in findings if f not in recording.findings]
-    return [SCALE_NOTICE, *filter(None, [left_out, sentence(weight)]), *recording.notices, *said]
+    weight = weight[:1].upper() + weight[1:]
+    return [SCALE_NOTICE, *filter(None, [left_out, weight]), *recording.notices, *said]
 
 
 def _estimator_of(
@@ -162,11 +163,6 @@ def doctors_findings(recording: Recording) -> list[Finding]:
     # the weight check is left out: `weight_objection` uses the vehicle of the replay
     found = [f for f in examine(recording) if f.grade is not Grade.HARMLESS and f.check != "weight"]
     return [f for f in found if f.signal in used]
-
-
-def sentence(clause: str) -> str:
-    """A clause with a capital first letter; "" stays."""
-    return clause[:1].upper() + clause[1:]
 
 
 def packet_counts(recording: Recording) -> tuple[int, int]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from crazyem.api.diagnosing import Diagnosis, diagnose
-from crazyem.api.inputs import RecordingLike, VehicleLike, recording_of, vehicle_of
+from crazyem.api.inputs import RecordingLike, VehicleLike, recording_of, recordings_of, vehicle_of
 from crazyem.diagnosis.prediction.ensemble import Ensemble, ensemble
 from crazyem.diagnosis.prediction.predict import recorded
 from crazyem.errors import DataError, UsageError
@@ -156,8 +156,7 @@ def check_vehicle(
         UsageError: no such file, or `file` is a vehicle file. FileFormatError: a file cannot be used.
         DataError: a recording cannot be used.
     """
-    flown = [recording_of(r, options) for r in _several(recordings)]
-    kept = [recording_of(r, options) for r in _several(held_out)]
+    flown, kept = recordings_of(recordings, options), recordings_of(held_out, options)
     if not flown:
         raise UsageError("a check needs at least one recording.")
     lacking = vehicle_of(base, flown[0])
@@ -244,7 +243,7 @@ def predict_ensemble(
     fitted = vehicle_of(vehicle, flight)
     members = sample(fitted, count, seed=seed, days=days, mass_sd=0.0).vehicles
     period = recorded(flight, fitted).period if step is None else step
-    others = [recording_of(r, options) for r in _several(calibrate)]
+    others = recordings_of(calibrate, options)
     return ensemble(flight, fitted, members, horizon=horizon * period, calibrate=others, seed=seed, plain=plain)
 
 
@@ -275,7 +274,3 @@ def _pooled(errors: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, di
         which: {q: float(np.sqrt(np.mean([e[which][q] ** 2 for e in errors]))) for q in errors[0][which]}
         for which in errors[0]
     }
-
-
-def _several(given: RecordingLike | Sequence[RecordingLike]) -> Sequence[RecordingLike]:
-    return given if isinstance(given, Sequence) and not isinstance(given, str) else [given]

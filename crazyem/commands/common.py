@@ -1,8 +1,8 @@
-"""Functions shared by the commands: write results to files and terminal, and raise errors after writing."""
+"""Functions shared by the commands: write results to files and terminal."""
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,7 @@ class LiveLine:
         self.session, self.prefix = session, prefix
         self.quiet: Callable[[], bool] = lambda: False
         self.phase, self.seconds = "connected", 0.0
-        self._steps_said = 0
-        self._faults_said: Sequence[Fault] = ()
+        self._news = News(prefix)
 
     def __call__(self, phase: str, seconds: float) -> None:
         self.phase, self.seconds = phase, seconds
@@ -40,28 +39,35 @@ class LiveLine:
         history.losses.append((self.session.clock.newest, lost))
         if not self.quiet():
             say(self.prefix + live_line(phase, seconds, self.session.estimate, lost=lost, pushes=len(history.pushes)))
-            self._steps_said = say_steps(history, self._steps_said, prefix=self.prefix)
-            self._faults_said = say_faults(history, self._faults_said, prefix=self.prefix)
+            self._news.steps(history)
+            self._news.faults(history)
 
 
-def say_steps(history: History, told: int, *, prefix: str = "") -> int:
-    """Print a line for each decided step of mass after the first `told` steps; returns the new number of told steps."""
-    for step in history.steps[told:]:
-        if step.real is None:
-            break
-        told += 1
-        if step.real:
-            say(f"{prefix}{step}")
-    return told
+class News:
+    """Prints a line for each step of mass and each fault of a history that it has not printed yet."""
 
+    def __init__(self, prefix: str = "") -> None:
+        self.prefix = prefix
+        self._steps = 0
+        self._faults: tuple[Fault, ...] = ()
 
-def say_faults(history: History, told: Sequence[Fault], *, prefix: str = "") -> Sequence[Fault]:
-    """Print a line for each fault not in `told`; a fault appears again once its estimated size has settled."""
-    faults = history.faults
-    for fault in faults:
-        if fault not in told:
-            say(f"{prefix}fault: {fault}")
-    return faults
+    def steps(self, history: History) -> None:
+        """The steps of mass whose cause is known."""
+        for step in history.steps[self._steps :]:
+            if step.real is None:
+                break
+            self._steps += 1
+            if step.real:
+                say(f"{self.prefix}{step}")
+
+    def faults(self, history: History) -> None:
+        """The faults; a fault appears again once its estimated size has settled."""
+        before, self._faults = self._faults, history.faults
+        if self._faults is before:
+            return
+        for fault in self._faults:
+            if fault not in before:
+                say(f"{self.prefix}fault: {fault}")
 
 
 def plot_path(arguments: argparse.Namespace, *others: str | None) -> str | None:
@@ -101,12 +107,6 @@ def report(arguments: argparse.Namespace, result: FlightResult, *, plot: str | N
         files = {"plot": plot, **files}
     if files:
         say("   ".join(f"{what}: {file}" for what, file in files.items()))
-
-
-def raise_after(error: BaseException | None) -> None:
-    """Raise the error that ended a flight; called after its results are on disk."""
-    if error is not None:
-        raise error
 
 
 def new_estimator(vehicle: Vehicle, arguments: argparse.Namespace, *, crazyflie: bool = True) -> Any:

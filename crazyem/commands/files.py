@@ -2,7 +2,6 @@
 
 import glob
 import os
-import stat
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,24 +71,18 @@ class _Search:
 
     def argument(self, name: str) -> None:
         path = Path(name)
-        if os.path.lexists(path):
-            self._named(path)
-        elif glob.has_magic(name):
+        if os.path.isdir(path):
+            self._folder(path)
+        elif os.path.exists(path) and not os.path.isfile(path):
+            raise UsageError(f"{path} is neither a file nor a folder.")
+        elif not os.path.lexists(path) and glob.has_magic(name):
             matches = sorted(glob.glob(name, recursive=True))
             if not matches:
                 raise UsageError(f"nothing matches {name}.")
             for match in matches:
                 self._matched(Path(match))
         else:
-            self._take(path, "")  # the file is missing; the reader gives the error
-
-    def _named(self, path: Path) -> None:
-        if path.is_dir():
-            self._folder(path)
-        elif path.exists() and not path.is_file():
-            raise UsageError(f"{path} is neither a file nor a folder.")
-        else:
-            self._take(path, "")
+            self._take(path, "")  # the reader gives the error if it is missing
 
     def _matched(self, path: Path) -> None:
         if path.is_dir():
@@ -121,12 +114,12 @@ class _Search:
                 path = Path(entry.path)
                 if entry.name.startswith("."):
                     continue
-                if _is(entry, stat.S_ISDIR):
+                if os.path.isdir(path):  # links are followed; False for a broken one
                     if _is_recording_folder(path):
                         self._take(path, _below(folder, top))
                     else:
                         inner.append(path)
-                elif _is(entry, stat.S_ISREG) and _is_recording(path, mapped=self.mapped):
+                elif os.path.isfile(path) and _is_recording(path, mapped=self.mapped):
                     self._take(path, _below(folder, top))
                 else:
                     self.skipped += 1
@@ -142,14 +135,6 @@ class _Search:
 def _below(folder: Path, top: Path) -> str:
     relative = str(folder.relative_to(top))
     return "" if relative == "." else relative
-
-
-def _is(entry: os.DirEntry[str], kind: Any) -> bool:
-    """Whether an entry is of a kind, links followed; False for a broken link. Does not open it: a pipe would block."""
-    try:
-        return bool(kind(entry.stat().st_mode))
-    except OSError:
-        return False
 
 
 def _is_recording(path: Path, *, mapped: bool) -> bool:

@@ -5,9 +5,9 @@ import contextlib
 from collections.abc import Iterator
 
 from crazyem.api.flying import FlightObserver, FlightSettings, Progress, observed_flight
-from crazyem.commands.common import LiveLine, plot_path, raise_after, report, say
+from crazyem.commands.common import LiveLine, plot_path, report, say
 from crazyem.commands.flights import interrupts, write_rules
-from crazyem.commands.view import Streams, SwarmInterrupts, Viewed, landing, live_view, wants_view
+from crazyem.commands.view import Stream, SwarmInterrupts, Viewed, landing, live_stream, live_view, wants_view
 from crazyem.control.named_trajectories import duration_note, trajectory_maker
 from crazyem.errors import CrazyemError
 from crazyem.live.flight import FlightInterruptedError, Interrupts, MotorsCutError
@@ -53,8 +53,8 @@ def run(arguments: argparse.Namespace) -> int:
         check_writable(path)
     view = wants_view(arguments)
     with contextlib.ExitStack() as stack:
-        streams = stack.enter_context(Streams(arguments.foxglove))
-        result, error = observed_flight(settings, _OnTheTerminal(view, streams, stack))
+        stream = stack.enter_context(live_stream(arguments.foxglove))
+        result, error = observed_flight(settings, _OnTheTerminal(view, stream, stack))
         if result is not None:
             try:
                 report(arguments, result, plot=plot)
@@ -63,22 +63,22 @@ def run(arguments: argparse.Namespace) -> int:
     if isinstance(error, FlightInterruptedError | MotorsCutError):
         say("crazyem: landed on request." if isinstance(error, FlightInterruptedError) else "crazyem: motors cut.")
         return 130
-    raise_after(error)
+    if error is not None:
+        raise error
     return 0
 
 
 class _OnTheTerminal(FlightObserver):
     """Observer that shows lines or a live view, streams to Foxglove, and handles Ctrl-C."""
 
-    def __init__(self, view: bool, streams: Streams, stack: contextlib.ExitStack) -> None:
-        self._view, self._streams, self._stack = view, streams, stack
+    def __init__(self, view: bool, stream: Stream, stack: contextlib.ExitStack) -> None:
+        self._view, self._stream, self._stack = view, stream, stack
 
     def say(self, sentence: str) -> None:
         say(sentence)
 
     def recorder(self, recorder: Recorder | None) -> Recorder | None:
-        both: Recorder | None = self._streams.with_stream(recorder)
-        return both
+        return self._stream(recorder, "")
 
     def interrupts(self) -> Interrupts:
         one = Interrupts()

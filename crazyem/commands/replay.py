@@ -2,14 +2,12 @@
 
 import argparse
 import time
-from collections.abc import Sequence
 
 from crazyem.api.replaying import replay
-from crazyem.commands.common import plot_path, report, say, say_faults, say_steps
+from crazyem.commands.common import News, plot_path, report, say
 from crazyem.commands.files import read_options
 from crazyem.live.history import History
 from crazyem.live.summary import check_writable, live_line
-from crazyem.monitoring.fault import Fault
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -35,14 +33,12 @@ class _EverySecond:
     """Prints a line each second, and a line for each step of mass."""
 
     def __init__(self) -> None:
-        self._shown, self._steps = time.monotonic(), 0
-        self._faults: Sequence[Fault] = ()
+        self._shown, self._news = time.monotonic(), News()
 
     def __call__(self, seconds: float, history: History) -> None:
         if time.monotonic() - self._shown > 1.0:
             self._shown = time.monotonic()
             newest = history.estimates[-1] if history.estimates else None
             say(live_line("replay", seconds, newest, lost=0, pushes=0))
-            self._steps = say_steps(history, self._steps)
-        if history.faults is not self._faults:
-            self._faults = say_faults(history, self._faults)
+            self._news.steps(history)
+        self._news.faults(history)

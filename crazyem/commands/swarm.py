@@ -8,7 +8,6 @@ import argparse
 import concurrent.futures
 import contextlib
 import functools
-import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +18,7 @@ from typing import Any
 from crazyem.commands.common import LiveLine, compile_kernels, new_estimator, say
 from crazyem.commands.flights import follow, interrupts, write_rules
 from crazyem.commands.output import put
-from crazyem.commands.view import Streams, SwarmInterrupts, Viewed, landing, live_view, wants_view
+from crazyem.commands.view import Stream, SwarmInterrupts, Viewed, landing, live_stream, live_view, wants_view
 from crazyem.control.named_trajectories import DEFAULT_HEIGHT, duration_note, trajectory_maker
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links.base import Link
@@ -29,7 +28,7 @@ from crazyem.live.flight_result import FlightResult
 from crazyem.live.runner import connect, finished, open_session
 from crazyem.live.scheduler import Scheduler, UpdateThrottle
 from crazyem.live.session import Session
-from crazyem.live.summary import check_writable, write_json
+from crazyem.live.summary import check_writable, interval_text, write_json
 from crazyem.live.swarm import (
     Course,
     Member,
@@ -74,6 +73,13 @@ class Drone:
     @property
     def name(self) -> str:
         return self.member.name
+
+    @property
+    def problem(self) -> dict[str, Any]:
+        """The error for the summary; empty without one, or if the user ended the flight."""
+        if not isinstance(self.error, CrazyemError):
+            return {}
+        return {"error": str(self.error), "exit_code": self.error.exit_code}
 
     def failed(self, error: BaseException) -> None:
         """Record an error that ends this drone's part; the first error counts."""
@@ -165,12 +171,12 @@ def _run(
     with contextlib.ExitStack() as stack:
         everyone = SwarmInterrupts([d.interrupts for d in drones])
         stack.enter_context(interrupts(everyone))
-        streams = stack.enter_context(Streams(arguments.foxglove))
+        stream = stack.enter_context(live_stream(arguments.foxglove))
         scheduler = Scheduler()
         stack.callback(scheduler.close)
         try:
             begin = functools.partial(
-                _begin, arguments, of=len(drones), wrench=wrench, streams=streams, scheduler=scheduler
+                _begin, arguments, of=len(drones), wrench=wrench, stream=stream, scheduler=scheduler
             )
             _connect(drones, begin, everyone)
             before([d for d in drones if d.error is None])
@@ -215,7 +221,7 @@ def _begin(
     *,
     of: int,
     wrench: str,
-    streams: Streams,
+    stream: Stream,
     scheduler: Scheduler,
 ) -> None:
     m, plan = drone.member, drone.plan
@@ -244,7 +250,7 @@ def _begin(
         rate=arguments.rate,
         reconnect=arguments.reconnect,
         wrench=wrench,
-        wrap=functools.partial(streams.with_stream, name=m.name),
+        wrap=lambda recorder: stream(recorder, m.name),
         scheduler=scheduler,
     )
     estimator.newest = lambda: session.clock.newest
@@ -355,12 +361,11 @@ def _row(drone: Drone) -> dict[str, Any]:
 
 def _report(arguments: argparse.Namespace, drones: Sequence[Drone]) -> int:
     results = [_row(drone) for drone in drones]
-    errors = [d.error for d in drones if d.error is not None]
-    stopped = any(isinstance(e, FlightInterruptedError | MotorsCutError) for e in errors)
-    real = [e for e in errors if not isinstance(e, FlightInterruptedError | MotorsCutError)]
-    code = _exit_code(real[0]) if real else 130 if stopped else 0
+    problems = [d.problem for d in drones if d.problem]
+    stopped = any(d.error is not None for d in drones)
+    code = problems[0]["exit_code"] if problems else 130 if stopped else 0
     rows = [
-        {"name": d.name, "uri": d.member.uri, "outcome": d.outcome, **row, **_error(d)}
+        {"name": d.name, "uri": d.member.uri, "outcome": d.outcome, **row, **d.problem}
         for d, row in zip(drones, results)
     ]
     text = table(rows)
@@ -373,16 +378,6 @@ def _report(arguments: argparse.Namespace, drones: Sequence[Drone]) -> int:
     return code
 
 
-def _exit_code(error: BaseException) -> int:
-    return error.exit_code if isinstance(error, CrazyemError) else 1
-
-
-def _error(drone: Drone) -> dict[str, Any]:
-    if drone.error is None or isinstance(drone.error, FlightInterruptedError | MotorsCutError):
-        return {}
-    return {"error": str(drone.error), "exit_code": _exit_code(drone.error)}
-
-
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """A line per drone for people; a parameter that is not identifiable has a question mark."""
     head = (
@@ -393,18 +388,11 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         values = []
         for name, width, scale in (("mass", 15, 1e3), ("Ixx", 13, 1e6), ("Iyy", 13, 1e6), ("Izz", 15, 1e6)):
             p = row.get("estimates", {}).get(name)
-            values.append(f"{_value(p, scale):>{width}}")
+            text = "-" if p is None else interval_text(p["value"], p["ci95"], p["identifiable"], scale=scale)
+            values.append(f"{text:>{width}}")
         lost = row.get("samples", {}).get("lost", "-")
         lines.append(
             f"{row['name']:<12.12} {' '.join(values)} {len(row.get('pushes', ())):>6} {lost:>5}  {row['outcome']}"
         )
     lines += [f"{row['name']}: note: {n}" for row in rows for n in row.get("notices", ()) if n != row.get("error")]
     return "\n".join(lines)
-
-
-def _value(p: dict[str, Any] | None, scale: float) -> str:
-    if p is None:
-        return "-"
-    half = (p["ci95"][1] - p["ci95"][0]) / 2 * scale
-    width = f"{half:.2f}" if math.isfinite(half) and half < 99 else ">99"
-    return f"{p['value'] * scale:.2f}+-{width}{'' if p['identifiable'] else '?'}"

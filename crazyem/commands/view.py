@@ -13,6 +13,9 @@ from crazyem.extras import installed, require
 from crazyem.live.flight import Interrupts
 from crazyem.live.recorder import Recorder
 
+# A recorder and a stream of the same data as one; the text is the prefix of topics if there are several drones.
+Stream = Callable[[Recorder | None, str], Recorder | None]
+
 
 def wants_view(arguments: argparse.Namespace) -> bool:
     """Whether to draw a live view: with --live, or by default if the output is a terminal.
@@ -102,29 +105,18 @@ def live_view(wanted: bool, drones: Callable[[], Sequence[Viewed]]) -> Iterator[
         say(dashboard.failure)
 
 
-class Streams:
-    """Context manager that adds a stream for Foxglove to recorders, if requested."""
+@contextlib.contextmanager
+def live_stream(port: int | None) -> Iterator[Stream]:
+    """A server for Foxglove during the block, unless `port` is None; yields the function that adds the stream."""
+    if port is None:
+        yield lambda recorder, name: recorder
+        return
+    from crazyem.live.foxglove import Both, FoxgloveServer
 
-    def __init__(self, port: int | None) -> None:
-        self._port = port
-        self._server: Any = None
+    with FoxgloveServer(port) as server:
+        say(f"live for Foxglove at {server.url} (layout: crazyem layout)")
 
-    def __enter__(self) -> "Streams":
-        if self._port is not None:
-            from crazyem.live.foxglove import FoxgloveServer
+        def with_stream(recorder: Recorder | None, name: str) -> Any:
+            return Both(recorder, server.recorder(name))
 
-            self._server = FoxgloveServer(self._port)
-            say(f"live for Foxglove at {self._server.url} (layout: crazyem layout)")
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._server is not None:
-            self._server.close()
-
-    def with_stream(self, recorder: Recorder | None, name: str = "") -> Any:
-        """The recorder, with a stream of the same data; `name` is the prefix of topics if there are several drones."""
-        if self._server is None:
-            return recorder
-        from crazyem.live.foxglove import Both
-
-        return Both(recorder, self._server.recorder(name))
+        yield with_stream

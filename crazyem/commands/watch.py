@@ -8,9 +8,9 @@ import argparse
 import contextlib
 import math
 
-from crazyem.commands.common import LiveLine, compile_kernels, new_estimator, plot_path, raise_after, report, say
+from crazyem.commands.common import LiveLine, compile_kernels, new_estimator, plot_path, report, say
 from crazyem.commands.flights import confirm_in_terminal, follow, interrupts
-from crazyem.commands.view import Streams, Viewed, live_view, wants_view
+from crazyem.commands.view import Stream, Viewed, live_stream, live_view, wants_view
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
 from crazyem.links.base import Link
@@ -46,10 +46,10 @@ def run(arguments: argparse.Namespace) -> int:
     error: BaseException | None = None
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(interrupts())
-        streams = stack.enter_context(Streams(arguments.foxglove))
+        stream = stack.enter_context(live_stream(arguments.foxglove))
         link = connect(stack, arguments.uri)
         say(f"watching {arguments.uri} (Ctrl-C ends)")
-        session = _open_session(arguments, stack, link, streams, vehicle, left_out, policy)
+        session = _open_session(arguments, stack, link, stream, vehicle, left_out, policy)
         try:
             session.start()
             if rules is not None:
@@ -75,12 +75,13 @@ def run(arguments: argparse.Namespace) -> int:
                 report(arguments, result, plot=plot)
         except CrazyemError as e:
             error = error or e
-    raise_after(error)
+    if error is not None:
+        raise error
     return 0
 
 
 def _open_session(
-    arguments: argparse.Namespace, stack: contextlib.ExitStack, link: Link, streams: Streams, vehicle: Vehicle,
+    arguments: argparse.Namespace, stack: contextlib.ExitStack, link: Link, stream: Stream, vehicle: Vehicle,
     left_out: list[str], policy: Policy,
 ) -> Session:  # fmt: skip
     """Open the session of a drone that another program flies."""
@@ -99,7 +100,7 @@ def _open_session(
         append=arguments.append,
         rate=arguments.rate,
         reconnect=arguments.reconnect,
-        wrap=streams.with_stream,
+        wrap=lambda recorder: stream(recorder, ""),
         monitor=monitor,
     )
 

@@ -3,7 +3,6 @@
 import math
 import time
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import Protocol
 
 from crazyem.errors import DataError
@@ -59,9 +58,8 @@ class Attachment:
             if estimate is not None and all(estimate[p].identifiable for p in parameters):
                 return estimate
             time.sleep(0.02)
-        estimate = self.estimate
-        why = "the drone has not flown" if estimate is None else ""
-        if estimate is not None:
+        why = "the drone has not flown"
+        if (estimate := self.estimate) is not None:
             why = "; ".join(f"{p}: {estimate[p].reason}" for p in parameters if not estimate[p].identifiable)
         raise DataError(f"no identifiable {' and '.join(parameters)} within {timeout:g} s ({why}).")
 
@@ -78,9 +76,7 @@ class Attachment:
     def __enter__(self) -> "Attachment":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

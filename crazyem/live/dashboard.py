@@ -6,9 +6,8 @@ Drawing never delays a flight: it takes no lock of the session, and only this th
 import contextlib
 import math
 import threading
-import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -17,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from crazyem.live.keys import Keys
-from crazyem.live.views import NOT_PUSHED, ParameterView, Snapshot
+from crazyem.live.views import NOT_PUSHED, ParameterView, SessionControls, Snapshot
 
 # s between pictures, and the same for many drones; number of drones that counts as many: each costs some ms
 FRAME_PERIOD, FRAME_PERIOD_OF_MANY, MANY_DRONES = 0.25, 1.0, 8
@@ -26,15 +25,6 @@ HELP = "p push on/off   r revert   m mark   l land   q quit view   Ctrl-C land a
 CHOOSE = "↹ next drone   "
 LOW_VOLTAGE = 3.3  # V, shown in red
 HIGH_LOSS = 0.05  # share of lost packets, shown in red
-
-
-class Controls(Protocol):
-    """Actions of keys on one drone; each returns one sentence for the status line."""
-
-    def toggle_push(self) -> str: ...
-    def revert(self) -> str: ...
-    def mark(self) -> str: ...
-    def land(self) -> str: ...
 
 
 def sparkline(values: Sequence[float], width: int = 24) -> str:
@@ -221,7 +211,7 @@ class Dashboard:
     def __init__(
         self,
         snapshots: Callable[[], Sequence[Snapshot]],
-        controls: Callable[[], Sequence[Controls]] = lambda: (),
+        controls: Callable[[], Sequence[SessionControls]] = lambda: (),
         *,
         console: Console,
         keys: Keys | None = None,
@@ -233,7 +223,6 @@ class Dashboard:
         self.message = ""
         self.failure = ""
         self.frames = 0
-        self.drawing_seconds = 0.0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="crazyem-dashboard", daemon=True)
 
@@ -273,7 +262,6 @@ class Dashboard:
             self.keys.end()
 
     def _draw(self, live: Any) -> int:
-        begun = time.thread_time()
         snapshots = self._snapshots()
         self.selected = min(self.selected, max(len(snapshots) - 1, 0))
         live.update(
@@ -284,7 +272,6 @@ class Dashboard:
             refresh=True,
         )  # fmt: skip
         self.frames += 1
-        self.drawing_seconds += time.thread_time() - begun
         return len(snapshots)
 
     def _wait(self, seconds: float) -> None:

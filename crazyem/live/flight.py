@@ -13,7 +13,7 @@ from crazyem.links.base import ConfirmingLink, Link
 from crazyem.live.controllers import Controller
 from crazyem.live.session import Session
 from crazyem.live.stream import SetpointStream
-from crazyem.live.telemetry import ARMED, CAN_FLY, FLYING, Telemetry
+from crazyem.live.telemetry import ARMED, CAN_FLY, FLYING
 from crazyem.live.write_supervisor import WriteRules
 
 BASELINE_SECONDS = 3.0  # s of hover before the first push: shows the behaviour with the present parameters
@@ -48,7 +48,6 @@ class FlightPlan:
 
     Attributes:
         trajectory: makes the trajectory from the hover point [m, world] and heading [rad] at its beginning.
-        controller: of the firmware.
         height: of the hover above the take-off point, m.
         push: whether estimates are written to the controller.
         rules: of these writes (policy, dry run, confirmation); None: the shipped policy.
@@ -90,9 +89,6 @@ class Flight:
     """Flies a plan over a session that is already running.
 
     Args:
-        session: connected link with packets flowing.
-        plan: what to fly.
-        interrupts: the user's Ctrl-C.
         progress: called about every second of host time with the phase and the seconds of firmware time in it.
     """
 
@@ -106,6 +102,7 @@ class Flight:
     ) -> None:
         self.session = session
         self.link = session.link
+        self.telemetry = session.telemetry
         self.plan = plan
         self.interrupts = interrupts or Interrupts()
         self._indi: IndiGains | None = None
@@ -118,10 +115,6 @@ class Flight:
         self._stream: SetpointStream | None = None
         self._ground = 0.0
         self._may_fly = False
-
-    @property
-    def telemetry(self) -> Telemetry:
-        return self.session.telemetry
 
     def fly(self) -> None:
         """Take off, fly, land. In every case the drone is brought down before this returns or raises.
@@ -170,8 +163,8 @@ class Flight:
             self._indi = IndiGains.of(told)
         if self.plan.push:
             note = self.session.push_to_controller(self.plan.rules)
-            if note and self.session.recorder is not None:
-                self.session.recorder.event(note)
+            if note:
+                self.session.record_event(note)
         if not telemetry.has(ARMED):
             self.link.arm(True)
             self._wait(lambda: telemetry.has(ARMED), 5.0, "the drone does not arm")
@@ -199,23 +192,17 @@ class Flight:
         path = after_hover(self.path, seconds=self.plan.baseline)
         record = self.session.recorder.setpoint if self.session.recorder is not None else None
         self._stream = stream = SetpointStream(
-            self.link,
-            path,
-            self.session.clock,
-            on_setpoint=record,
-            reconnecting=lambda: self.session.reconnecting,
-            indi=self._indi,
-        )
+            self.link, path, self.session.clock,
+            on_setpoint=record, reconnecting=lambda: self.session.reconnecting, indi=self._indi,
+        )  # fmt: skip
         self._enter("hovering")
         stream.start()
-        self._mark("trajectory_start", self.session.clock.newest)
+        self._mark("trajectory_start")
         self._wait(lambda: stream.elapsed >= self.plan.baseline, math.inf)
         self._enter(path.name)
-        self._mark("push_enabled", self.session.clock.newest)
-        self.session.pipeline.push_from = self.session.clock.newest
+        self.session.pipeline.push_from = self._mark("push_enabled")
         self._wait(lambda: stream.elapsed >= path.duration or path.finished(), math.inf)
-        self.session.pipeline.push_until = self.session.clock.newest
-        self._mark("trajectory_end", self.session.clock.newest)
+        self.session.pipeline.push_until = self._mark("trajectory_end")
 
     def _land(self) -> None:
         """Hand over to the high-level commander, land, and check that the drone has landed."""
@@ -265,13 +252,13 @@ class Flight:
         link = self.link
         if isinstance(link, ConfirmingLink) and link.land_and_confirm(self._ground, duration, timeout=CONFIRMED_WITHIN):
             for _ in range(HAND_OVERS):
-                self.link.release_setpoints()
+                link.release_setpoints()
                 self._sleep(HAND_OVER_EVERY)
             return
         for _ in range(HAND_OVERS):
-            self.link.land(self._ground, duration)
+            link.land(self._ground, duration)
             self._sleep(HAND_OVER_EVERY)
-            self.link.release_setpoints()
+            link.release_setpoints()
 
     def _landed(self) -> bool:
         return not self.telemetry.has(FLYING) and not self.telemetry.height > self._ground + 0.15
@@ -318,13 +305,13 @@ class Flight:
     def _enter(self, phase: str) -> None:
         self.phase = phase
         self._phase_start = self.session.clock.newest
-        if self.session.recorder is not None:
-            self.session.recorder.event(phase)
+        self.session.record_event(phase)
 
-    def _mark(self, name: str, firmware_time: float) -> None:
-        self.session.history.marks[name] = firmware_time
-        if self.session.recorder is not None:
-            self.session.recorder.event(f"mark {name} {firmware_time!r}")
+    def _mark(self, name: str) -> float:
+        """Mark the newest time [s] on the drone's clock, and return it."""
+        newest = self.session.clock.newest
+        self.session.mark(name, newest)
+        return newest
 
     def _sleep(self, seconds: float) -> None:
         until = self.session.clock.newest + seconds
@@ -369,9 +356,5 @@ class Flight:
             raise LinkError(f"setpoints could not be sent: {self._stream.failure}.")
         if now - self._report >= REPORT_EVERY:
             self._report = now
-            self.progress(self.phase, clock_seconds(self.session.clock.newest, self._phase_start))
-
-
-def clock_seconds(now: float, start: float) -> float:
-    """Seconds in a phase, 0 if unknown."""
-    return now - start if math.isfinite(now - start) else 0.0
+            seconds = self.session.clock.newest - self._phase_start
+            self.progress(self.phase, seconds if math.isfinite(seconds) else 0.0)

@@ -49,7 +49,8 @@ class FoxgloveServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        with contextlib.suppress(RuntimeError):
+            self._server.stop()
 
     @property
     def url(self) -> str:
@@ -57,19 +58,8 @@ class FoxgloveServer:
         return f"ws://{FOXGLOVE_HOST}:{self.port}"
 
     def recorder(self, name: str = "") -> RecordingWriter:
-        """The recorder through which a session streams.
-
-        Args:
-            name: of the drone, before its topics (/NAME/estimate, frame NAME); "" if there is only one drone.
-        """
+        """The recorder through which a session streams; `name` comes before its topics, if not "" (/NAME/estimate)."""
         return RecordingWriter("", output=Topics(self._context, name))
-
-    def close(self) -> None:
-        """End the server."""
-        server, self._server = self._server, None
-        if server is not None:
-            with contextlib.suppress(RuntimeError):
-                server.stop()
 
 
 class Topics:

@@ -153,16 +153,13 @@ class Guard:
         if controller.incremental:
             self.limits = self.limits.for_incremental()
         self.stopped = ""
-        self.beliefs = self._beliefs()
+        self.beliefs = {belief.name: belief.read(self.originals) for belief in controller.beliefs}
         self._history: deque[tuple[float, dict[str, float], dict[str, str]]] = deque()
         self._last_write = float("-inf")
         self._before: tuple[dict[str, float], float] | None = None
         self._step: Step | None = None
         self.capped = True  # whether `unjudged` limits changes; False if writes are not judged
         self._trusted = dict(self.beliefs)  # beliefs of the controller that were last judged good
-
-    def _beliefs(self) -> dict[str, float]:
-        return {belief.name: belief.read(self.originals) for belief in self.controller.beliefs}
 
     def withdraw(self) -> None:
         """The newest decision was not carried out: the controller keeps its old beliefs."""
@@ -195,7 +192,6 @@ class Guard:
         """The decision after an estimate.
 
         Args:
-            estimate: the newest.
             time: s on the drone's clock.
             airborne: False on the ground or in contact; this clears the history.
             enabled: False in phases of the flight without writes; the history is kept.

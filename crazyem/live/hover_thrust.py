@@ -20,11 +20,7 @@ _NO_CONTROLLER = -1  # there is no stabilizer.controller
 
 
 def hover_target(link: HoverThrustLink, vehicle: Vehicle) -> tuple[Controller | None, str]:
-    """The target of pushes on a MAVLink drone, or None and one sentence why there is none.
-
-    Args:
-        link: open. vehicle: the parameter is assumed to be right at its mass.
-    """
+    """The target of pushes on a MAVLink drone, or None and one sentence why there is none."""
     name = link.hover_parameter
     if not name:
         return None, "this autopilot has no hover thrust parameter that is known here: estimates are not pushed."

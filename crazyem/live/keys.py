@@ -5,7 +5,6 @@ import contextlib
 import os
 import select
 import sys
-from types import TracebackType
 from typing import Any
 
 try:
@@ -42,7 +41,7 @@ class Keys:
         self.begin()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.end()
 
     @property

@@ -6,7 +6,7 @@ order give the same estimates, live or in a replay.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 from crazyem.estimation.result import Estimate, Step
 from crazyem.live.flight_monitor import FlightMonitor
@@ -34,53 +34,28 @@ class Gate(Protocol):
     def on_mass_step(self, step: Step, time: float) -> None: ...
 
 
-@runtime_checkable
-class StepFinder(Protocol):
-    """An estimator that detects steps of mass."""
-
-    @property
-    def steps(self) -> Sequence[Step]: ...
-
-
-@runtime_checkable
-class EstimatorAround(Protocol):
-    """An estimator around another one."""
-
-    @property
-    def inner(self) -> Any: ...
-
-
-@runtime_checkable
-class ResidualSource(Protocol):
-    """An estimator that gives the innovations of its newest sample: time [s], values, standard deviations."""
-
-    @property
-    def residual(self) -> tuple[float, Any, Any] | None: ...
-
-
-def steps_of(estimator: object) -> Sequence[Step]:
+def steps_of(estimator: Any) -> Sequence[Step]:
     """The steps of mass that an estimator, or the one inside it, has detected; empty if it detects none."""
-    if isinstance(estimator, StepFinder):
-        return tuple(estimator.steps)
-    return steps_of(estimator.inner) if isinstance(estimator, EstimatorAround) else ()
+    while not hasattr(estimator, "steps") and hasattr(estimator, "inner"):
+        estimator = estimator.inner
+    return tuple(getattr(estimator, "steps", ()))
 
 
-def residual_of(estimator: object) -> tuple[float, Any, Any] | None:
-    """Innovations of the newest sample, None if the estimator does not give them."""
-    return estimator.residual if isinstance(estimator, ResidualSource) else None
+def residual_of(estimator: Any) -> tuple[float, Any, Any] | None:
+    """Time [s], innovations and their standard deviations of the newest sample; None if the estimator has none."""
+    residual: tuple[float, Any, Any] | None = getattr(estimator, "residual", None)
+    return residual
 
 
 class Pipeline:
     """Feeds samples to the estimator, its estimates to the guard, and the guard's decisions to `push`.
 
     Args:
-        estimator: see `Estimator`.
         history: keeps track, estimates and pushes for the summary.
         guard: None: nothing is pushed.
         push: takes a decision with writes; must not block.
         on_estimate: called with every estimate (live line, recording).
         on_step: called with every step of mass when it is detected, and again when its cause is known.
-        monitor: of faults in flight, or None.
     """
 
     def __init__(

@@ -10,6 +10,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 from crazyem.live.policy import MonitorLimits
+from crazyem.live.telemetry import tilt_of
 from crazyem.signals.sample import Sample
 
 ALARM_SECONDS = 0.3  # s, averaging time of an alarm
@@ -108,8 +109,7 @@ class PostWriteMonitor:
             elif sample.signal == "body_rate":
                 self._body_rate(sample.time, sample.value)
             elif sample.signal == "attitude":
-                x, y = sample.value[0], sample.value[1]
-                self._tilt = math.acos(min(max(1.0 - 2.0 * (x * x + y * y), -1.0), 1.0))
+                self._tilt = tilt_of(sample.value)
 
     def innovation(self, time: float, mean_square: float) -> None:
         """Mean square of the normalised innovations of a sample at `time` [s]."""

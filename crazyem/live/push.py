@@ -61,7 +61,6 @@ class Pusher:
     again.
 
     Args:
-        link: to the drone.
         guard: is stopped after an unconfirmed write.
         gate: checked before every packet.
         history: keeps every write.

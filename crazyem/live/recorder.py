@@ -44,8 +44,8 @@ def open_recorder(
 
     Args:
         configuration: of the run; values are stored as JSON.
-        vehicle: its file's text is stored, so that a replay starts from the same constants.
-        link: connected; its tables and the firmware's description of itself, if known, are stored.
+        vehicle: its text is stored, so that a replay starts from the same constants.
+        link: connected; its tables and the firmware's description of itself are stored.
         append: continue an existing recording as its next session (after a reconnect) instead of replacing it.
 
     Raises: UsageError: the file cannot be created. FileFormatError: it cannot be continued.

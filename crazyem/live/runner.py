@@ -48,28 +48,17 @@ def open_session(
 
     Args:
         left_out: effects of the vehicle file that the estimator does not know.
-        configuration: of the run, for the recording.
-        record: path of the recording; None: no recording. append: continue an existing one.
-        rate: of the log, Hz. reconnect: s, longest time to reconnect a lost link.
-        wrench: log group of the controller whose commanded thrust and torque are recorded.
-        scheduler: of updates for many drones. monitor: of faults in flight; on_fault: takes its reports.
+        configuration, record, append: see `open_recorder`.
+        rate, reconnect, wrench, scheduler, monitor, on_fault: see `Session`.
         wrap: adds other receivers of the recorder's messages, such as a live stream.
     """
     recorder = wrap(open_recorder(record, configuration=configuration, vehicle=vehicle, link=link, append=append))
     if recorder is not None:
         stack.callback(recorder.close)
     session = Session(
-        link,
-        vehicle=vehicle,
-        estimator=estimator,
-        recorder=recorder,
-        wrench=wrench,
-        rate=rate,
-        reconnect_within=reconnect,
-        scheduler=scheduler,
-        monitor=monitor,
-        on_fault=on_fault,
-    )
+        link, vehicle=vehicle, estimator=estimator, recorder=recorder, wrench=wrench, rate=rate,
+        reconnect_within=reconnect, scheduler=scheduler, monitor=monitor, on_fault=on_fault,
+    )  # fmt: skip
     stack.callback(session.close)
     session.history.notice(folding.notice(left_out))
     return session
@@ -84,14 +73,9 @@ def finished(
         close_recorder(session.recorder, statistics, session.history)
     try:
         result = result_of(
-            session.pipeline,
-            session.vehicle,
-            title=title,
-            log=log,
-            received=statistics.received,
-            lost=statistics.lost,
-            extra={**extra, "late": statistics.late},
-        )
+            session.pipeline, session.vehicle, title=title, log=log, received=statistics.received,
+            lost=statistics.lost, extra={**extra, "late": statistics.late},
+        )  # fmt: skip
     except CrazyemError as late:
         return None, error or late
     return result, error

@@ -194,11 +194,6 @@ class UpdateThrottle:
         self.behind = 0.0
 
     @property
-    def every(self) -> int:
-        """Samples between updates if none is skipped."""
-        return self._every
-
-    @property
     def airborne(self) -> bool:
         """Of the inner estimator."""
         return bool(self.inner.airborne)

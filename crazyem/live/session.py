@@ -37,7 +37,7 @@ from crazyem.live.pipeline import Estimator, Pipeline, residual_of
 from crazyem.live.policy import load_policy
 from crazyem.live.push import Pusher, nominal_estimates, push_target, read_originals
 from crazyem.live.recorder import FrameRecorder, Recorder
-from crazyem.live.scheduler import Mailbox, Scheduler
+from crazyem.live.scheduler import Scheduler
 from crazyem.live.telemetry import Telemetry
 from crazyem.live.write_gate import WriteGate
 from crazyem.live.write_supervisor import WriteRules, WriteSupervisor
@@ -60,9 +60,6 @@ class Session:
 
     Args:
         link: connected.
-        vehicle: nominal constants.
-        estimator: fed from one thread.
-        recorder: or None.
         wrench: log group of the controller whose commanded thrust and torque are recorded.
         on_estimate: called in the estimator's thread with every estimate.
         rate: of the log, Hz; above 100 the firmware must allow block periods in milliseconds.
@@ -108,13 +105,11 @@ class Session:
         if monitor is not None:
             monitor.on_fault = self._found_fault
         self.pipeline = Pipeline(estimator, history=self.history, on_estimate=self._estimated, monitor=monitor)
-        self.pipeline.on_step = lambda step: self._record_event(str(step))
+        self.pipeline.on_step = lambda step: self.record_event(str(step))
         self.blocks: tuple[Block, ...] = ()
         self._samples: queue.SimpleQueue[list[Sample] | None] = queue.SimpleQueue()
         self._scheduler = scheduler
-        self._mailbox: Mailbox | None = (
-            scheduler.mailbox(self._feed, self._estimating_failed) if scheduler is not None else None
-        )
+        self._mailbox = scheduler.mailbox(self._feed, self._estimating_failed) if scheduler is not None else None
         self._receiving_ended = False  # nothing is received any more
         self._reconnection: threading.Thread | None = None  # with a scheduler only: its thread must not wait
         self._link_recorded = -math.inf
@@ -152,10 +147,9 @@ class Session:
             self._threads.append(thread)
 
     def push_to_controller(self, rules: WriteRules | None = None) -> str:
-        """Let the guard push to the active controller; returns a sentence for the user, or "".
+        """Let the guard push to the active controller, by the shipped policy without `rules`.
 
-        Args:
-            rules: policy, dry run, confirmation; None: the shipped policy.
+        Returns: a sentence for the user, or "".
         """
         rules = rules or WriteRules(load_policy())
         if isinstance(self.link, HoverThrustLink):
@@ -185,7 +179,7 @@ class Session:
             now=lambda: self.clock.newest,
             residual=lambda: residual_of(self.pipeline.estimator),
             enabled=lambda time: self.pipeline.push_from <= time <= self.pipeline.push_until,
-            record=self._record_event,
+            record=self.record_event,
             fault=self.pipeline.fault_objection,
         )
         if not rules.dry_run:
@@ -224,9 +218,17 @@ class Session:
     def _draw_end(self) -> None:
         until = self.clock.newest  # of the packets before this one; later packets may still carry older stamps
         self.pipeline.estimate_until = until
-        self.history.marks["estimate_end"] = until
+        self.mark("estimate_end", until)
+
+    def mark(self, name: str, time: float) -> None:
+        """Add a mark at `time` [s] of the drone's clock to history and recording."""
+        self.history.marks[name] = time
+        self.record_event(f"mark {name} {time!r}")
+
+    def record_event(self, text: str) -> None:
+        """Add an event to the recording, if there is one."""
         if self.recorder is not None:
-            self.recorder.event(f"mark estimate_end {until!r}")
+            self.recorder.event(text)
 
     def raise_if_failed(self) -> None:
         """Raise the error of a thread, or LinkError if the drone is lost."""
@@ -240,11 +242,9 @@ class Session:
         reason = self.lost.reason.rstrip(".") if self.lost else "no packets arrive"
         if self.link.uri not in reason:
             reason = f"the drone at {self.link.uri} was lost: {reason}"
-        tail = (
-            f"; the recording {self.recorder.path} is intact up to there"
-            if self.recorder is not None and self.recorder.path
-            else ""
-        )
+        tail = ""
+        if self.recorder is not None and self.recorder.path:
+            tail = f"; the recording {self.recorder.path} is intact up to there"
         return f"{reason[:1].lower()}{reason[1:]}{tail}."
 
     def close(self) -> None:
@@ -285,7 +285,7 @@ class Session:
     def _found_fault(self, fault: Fault) -> None:
         """Report a fault to recording, history and callback; its settled report comes after the first one."""
         for line in event_lines(fault):
-            self._record_event(line)
+            self.record_event(line)
         if fault.settled:
             self.history.notice(f"{fault}.")
         if self.pipeline.monitor is not None and self.pipeline.monitor.wants_landing(fault):
@@ -347,7 +347,7 @@ class Session:
         self._receiving_ended = True
         self.telemetry.heard = -math.inf
         self.stop_pushing()
-        self.failure = error if isinstance(error, CrazyemError) else CrazyemError(f"receiving failed: {error!r}")
+        self.failure = _known(error, "receiving")
 
     @property
     def reconnecting(self) -> bool:
@@ -367,7 +367,7 @@ class Session:
             self._give_up(lost)
             return False
         self._linked.clear()
-        self._record_event(f"the link was lost, trying again: {lost.reason}")
+        self.record_event(f"the link was lost, trying again: {lost.reason}")
         try:
             outage = link.reconnect(self.reconnect_within, self._stop)
         except LinkError as error:
@@ -383,7 +383,7 @@ class Session:
             f"{outage.after_ms / 1000:.3f} s of the drone's clock) and came back."
         )
         self.history.notice(sentence)
-        self._record_event(sentence)
+        self.record_event(sentence)
         return True
 
     def _give_up(self, lost: LinkLost) -> None:
@@ -391,10 +391,6 @@ class Session:
         if lost.restarted and self.write_supervisor is not None:
             self.write_supervisor.on_restart()
         self.lost = lost
-
-    def _record_event(self, sentence: str) -> None:
-        if self.recorder is not None:
-            self.recorder.event(sentence)
 
     def _packet(self, packet: Packet) -> None:
         if self._end_wanted and self.pipeline.estimate_until == math.inf and math.isfinite(self.clock.newest):
@@ -446,5 +442,8 @@ class Session:
             self.pipeline.sample(sample)
 
     def _estimating_failed(self, error: Exception) -> None:
-        known = error if isinstance(error, CrazyemError) else CrazyemError(f"estimating failed: {error!r}")
-        self.failure = self.failure or known
+        self.failure = self.failure or _known(error, "estimating")
+
+
+def _known(error: Exception, what: str) -> CrazyemError:
+    return error if isinstance(error, CrazyemError) else CrazyemError(f"{what} failed: {error!r}")

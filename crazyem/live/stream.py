@@ -44,10 +44,8 @@ class SetpointStream:
         self.on_setpoint = on_setpoint
         self.indi = indi
         self.reconnecting = reconnecting or (lambda: False)
-        self.left_out = 0
         self._reached = 0.0
         self._after_outage = False
-        self.sent = 0
         self.failure: Exception | None = None
         self.began = float("nan")
         self._stop = threading.Event()
@@ -75,13 +73,10 @@ class SetpointStream:
             while not self._stop.is_set():
                 firmware = self.clock.now()
                 r = self.trajectory.at(self._progress(firmware))
-                if self._send(r):
-                    self.sent += 1
-                    if self.on_setpoint is not None:
-                        self.on_setpoint(firmware, r)
-                due = max(
-                    due + max(SETPOINT_PERIOD / max(self.clock.rate, 1e-3), SHORTEST_PERIOD), time.monotonic() - 0.05
-                )
+                if self._send(r) and self.on_setpoint is not None:
+                    self.on_setpoint(firmware, r)
+                period = max(SETPOINT_PERIOD / max(self.clock.rate, 1e-3), SHORTEST_PERIOD)
+                due = max(due + period, time.monotonic() - 0.05)
                 self._stop.wait(max(due - time.monotonic(), 0.0))
         except Exception as error:
             self.failure = error
@@ -111,6 +106,5 @@ class SetpointStream:
                 if time.monotonic() > until or self._stop.is_set():
                     raise error
                 time.sleep(0.005)
-            self.left_out += 1
             return False
         return True

@@ -149,10 +149,14 @@ def live_line(phase: str, seconds: float, estimate: Estimate | None, *, lost: in
     if estimate is None:
         return f"{head}  no estimate yet"
     parts = []
-    for name, unit, scale in (("mass", "g", 1e3), ("Ixx", "", 1e6), ("Iyy", "", 1e6), ("Izz", "e-6 kg m2", 1e6)):
+    for name, unit, scale in (("mass", " g", 1e3), ("Ixx", "", 1e6), ("Iyy", "", 1e6), ("Izz", " e-6 kg m2", 1e6)):
         p = estimate[name]
-        half = (p.ci95[1] - p.ci95[0]) / 2 * scale
-        width = f"{half:.2f}" if half < 99 else ">99"  # keeps the line within a terminal
-        mark = "" if p.identifiable else "?"
-        parts.append(f"{name} {p.value * scale:.2f}+-{width}{mark}{' ' + unit if unit else ''}")
+        parts.append(f"{name} {interval_text(p.value, p.ci95, p.identifiable, scale=scale)}{unit}")
     return f"{head}  {'  '.join(parts)}  lost {lost}  pushes {pushes}"
+
+
+def interval_text(value: float, ci95: Sequence[float], identifiable: bool, *, scale: float) -> str:
+    """A value with the half width of its interval, both times `scale`; with a question mark if not identifiable."""
+    half = (ci95[1] - ci95[0]) / 2 * scale
+    width = f"{half:.2f}" if half < 99 else ">99"  # keeps the line within a terminal
+    return f"{value * scale:.2f}+-{width}{'' if identifiable else '?'}"

@@ -1,6 +1,7 @@
 """The newest state of the drone, for the sequence of a flight (the pipeline estimates, not this module)."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from crazyem.estimation.contact import CONTACT_HEIGHT, ContactGate
@@ -12,6 +13,12 @@ LANDING_SECONDS = 0.3
 
 # supervisor.info, firmware supervisor.c
 CAN_ARM, ARMED, AUTO_ARM, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << i for i in range(8))
+
+
+def tilt_of(attitude: Sequence[float]) -> float:
+    """Angle [rad] between the z axes of body and world. attitude: quaternion x, y, z, w."""
+    x, y = attitude[0], attitude[1]
+    return math.acos(min(max(1.0 - 2.0 * (x * x + y * y), -1.0), 1.0))
 
 
 @dataclass

@@ -95,19 +95,14 @@ class Observer:
 
     Args:
         session: running, or not yet started.
-        name: of the drone.
-        phase: phase of the flight and seconds in it.
-        ended: why the flight is over, "" before its end.
+        phase: gives the phase of the flight and the seconds in it.
+        ended: gives why the flight is over, "" before its end.
     """
 
     def __init__(
-        self,
-        session: Session,
-        *,
-        name: str,
-        phase: Callable[[], tuple[str, float]],
+        self, session: Session, *, name: str, phase: Callable[[], tuple[str, float]],
         ended: Callable[[], str] = lambda: "",
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.session, self.name = session, name
         self._phase, self._ended = phase, ended
         self._counted: tuple[float, int, int] | None = None
@@ -212,9 +207,7 @@ class SessionControls:
     """Actions on one drone; every method returns at once with one sentence about its effect. Called from one thread.
 
     Args:
-        session: running.
         land: makes the flight land; None if another program flies the drone.
-        name: of the drone, for the sentences.
     """
 
     def __init__(self, session: Session, *, name: str, land: Callable[[], None] | None = None) -> None:
@@ -228,7 +221,7 @@ class SessionControls:
             return f"{self.name}: nothing is pushed in this session."
         pipeline.paused = not pipeline.paused
         state = "off" if pipeline.paused else "on"
-        self._record_event(f"guard: pushing switched {state} by the user")
+        self.session.record_event(f"guard: pushing switched {state} by the user")
         return f"{self.name}: pushing is {state}."
 
     def revert(self) -> str:
@@ -239,12 +232,11 @@ class SessionControls:
 
     def mark(self) -> str:
         """Add an event to the recording and a mark to the summary."""
-        time, marks = self.session.clock.newest, self.session.history.marks
+        time = self.session.clock.newest
         if not math.isfinite(time):
             return f"{self.name}: nothing was received yet."
-        number = 1 + sum(name.startswith(USER_MARK) for name in tuple(marks))
-        marks[f"{USER_MARK}{number}"] = time
-        self._record_event(f"mark {USER_MARK}{number} {time!r}")
+        number = 1 + sum(name.startswith(USER_MARK) for name in tuple(self.session.history.marks))
+        self.session.mark(f"{USER_MARK}{number}", time)
         where = "" if self.session.recorder is not None else " (there is no recording)"
         return f"{self.name}: mark {number} at {time:.2f} s{where}."
 
@@ -254,7 +246,3 @@ class SessionControls:
             return f"{self.name}: somebody else flies it."
         self._land()
         return f"{self.name}: landing."
-
-    def _record_event(self, text: str) -> None:
-        if self.session.recorder is not None:
-            self.session.recorder.event(text)

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable
 
 from crazyem.live.policy import HealthLimits
-from crazyem.live.telemetry import CRASHED, FLYING, LOCKED, TUMBLED, Telemetry
+from crazyem.live.telemetry import CRASHED, FLYING, LOCKED, TUMBLED, Telemetry, tilt_of
 from crazyem.signals.sample import Sample
 
 # s on the drone's clock; older telemetry does not show the present state
@@ -74,8 +74,7 @@ class WriteGate:
             while sample.time - self._voltages[0][0] > VOLTAGE_AVERAGE_SECONDS:
                 self._voltages.popleft()
         elif sample.signal == "attitude":
-            x, y = sample.value[0], sample.value[1]
-            self._tilt = math.acos(min(max(1.0 - 2.0 * (x * x + y * y), -1.0), 1.0))
+            self._tilt = tilt_of(sample.value)
 
     @property
     def voltage(self) -> float:

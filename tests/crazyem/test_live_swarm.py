@@ -293,7 +293,7 @@ def test_errors_of_one_drone_keep_their_exit_code():
     drone = command.Drone(members_of(["u"], vehicle="cf2", trajectory=["hover"])[0], None, [])
     drone.failed(LinkError("gone."))
     drone.failed(CrazyemError("and later."))
-    assert command._error(drone) == {"error": "gone.", "exit_code": 4}
+    assert drone.problem == {"error": "gone.", "exit_code": 4}
 
 
 @pytest.mark.slow
