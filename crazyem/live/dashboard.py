@@ -222,7 +222,6 @@ class Dashboard:
         self.selected = 0
         self.message = ""
         self.failure = ""
-        self.frames = 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="crazyem-dashboard", daemon=True)
 
@@ -271,7 +270,6 @@ class Dashboard:
             ),
             refresh=True,
         )  # fmt: skip
-        self.frames += 1
         return len(snapshots)
 
     def _wait(self, seconds: float) -> None:

@@ -65,13 +65,12 @@ def test_options_named_in_the_interface_exist():
     assert parser().parse_args(["watch", "udp://127.0.0.1:1"]).uri
 
 
-def test_nothing_at_the_uri(capsys, free_port):
-    said = fails(capsys, "fly", f"udp://127.0.0.1:{free_port}", "--trajectory", "hover", code=4)
-    assert f"udp://127.0.0.1:{free_port}" in said
-
-
-def test_uri_after_the_trajectory_is_still_the_uri(capsys, free_port):
-    assert "Nothing answers" in fails(capsys, "fly", "--trajectory", "hover", f"udp://127.0.0.1:{free_port}", code=4)
+@pytest.mark.parametrize("words", ["{uri} --trajectory hover", "--trajectory hover {uri}"])
+def test_nothing_at_the_uri_which_may_follow_the_trajectory(capsys, free_port, words):
+    uri = f"udp://127.0.0.1:{free_port}"
+    said = fails(capsys, "fly", *words.format(uri=uri).split(), code=4)
+    assert "Nothing answers" in said
+    assert uri in said
 
 
 @pytest.mark.slow

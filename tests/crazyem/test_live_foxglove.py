@@ -8,6 +8,7 @@ import sys
 
 import pytest
 from fake_drone import FakeEstimator, FakeLink
+from fake_flight import Recorder
 
 from crazyem.cli import main
 from crazyem.errors import UsageError
@@ -26,16 +27,6 @@ def test_without_the_extra_there_is_one_sentence(monkeypatch, capsys):
     assert "--foxglove needs foxglove, which is not installed" in capsys.readouterr().err
 
 
-class Recorder:
-    """Remembers the names of calls."""
-
-    def __init__(self, path=""):
-        self.path, self.failure, self.calls = path, "", []
-
-    def __getattr__(self, name):
-        return lambda *arguments: self.calls.append((name, *arguments))
-
-
 def test_a_file_and_a_stream_get_the_same_and_the_file_counts():
     file, stream = Recorder("a.mcap"), Recorder("never")
     file.failure, stream.failure = "disk full", "irrelevant"
@@ -47,7 +38,7 @@ def test_a_file_and_a_stream_get_the_same_and_the_file_counts():
     both.residual(1.0, [0.0], [1.0])
     both.close()
     assert file.calls == stream.calls
-    assert [name for name, *_ in file.calls] == ["event", "packet", "link", "residual", "close"]
+    assert [name for name, _ in file.calls] == ["event", "packet", "link", "residual", "close"]
     alone = live.Both(None, stream)
     assert (alone.path, alone.failure) == ("", "")
 

@@ -47,17 +47,12 @@ def test_nothing_is_echoed_and_control_c_stays_a_signal(terminal):
     assert termios.tcgetattr(slave) == before
 
 
-def test_keys_pressed_at_once_are_not_lost(terminal):
+def test_keys_pressed_at_once_are_not_lost_and_arrow_keys_are_no_letters(terminal):
     master, slave = terminal
     with Keys(slave) as keys:
         os.write(master, b"xrl\x1b[B")
         assert [keys.read(5.0) for _ in range(3)] == ["x", "r", "l"]
         assert keys.read(0.0) == ""
-
-
-def test_arrow_keys_are_no_letters(terminal):
-    master, slave = terminal
-    with Keys(slave) as keys:
         os.write(master, b"\x1b[A")
         assert keys.read(5.0) == ""
         os.write(master, b"m")

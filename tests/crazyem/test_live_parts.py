@@ -5,20 +5,15 @@ import math
 import random
 import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
-import fake_drone as fake
 import numpy as np
 import pytest
 
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
 from crazyem.live.clock import FirmwareClock
-from crazyem.live.guard import Decision
 from crazyem.live.history import MOST_ESTIMATES, SETTLE_SECONDS, History, Push, Track
-from crazyem.live.pipeline import Pipeline
 from crazyem.live.plot import figure_of
-from crazyem.live.push import Pusher
 from crazyem.live.simulator import Simulator
 from crazyem.live.summary import build_summary, check_writable, live_line, text_summary, write_json
 from crazyem.notebook import saved
@@ -138,25 +133,6 @@ def test_a_long_flight_keeps_the_newest_estimates_and_fewer_of_the_old_ones():
     assert times[-MOST_ESTIMATES // 2 :] == list(range(count - MOST_ESTIMATES // 2, count))
 
 
-def test_pipeline_needs_nothing_but_samples():
-    class Echo:
-        airborne = True
-        update_seconds = ()
-
-        def feed(self, sample):
-            return estimate(sample.time)
-
-        def finish(self):
-            return estimate(99.0)
-
-    seen = []
-    pipeline = Pipeline(Echo(), history=History(), on_estimate=seen.append)
-    for t in np.arange(3.0):
-        pipeline.sample(Sample("position", float(t), (0.0, 0.0, 0.0)))
-    pipeline.finish()
-    assert [e.time for e in seen] == [0.0, 1.0, 2.0, 99.0]
-
-
 def command(script):
     return [sys.executable, "-c", script]
 
@@ -167,11 +143,13 @@ def test_simulator_that_refuses_its_scenario_speaks_for_itself(tmp_path):
         Simulator(scenario=tmp_path / "s.toml", command=command(script)).start()
 
 
-def test_simulator_that_dies_or_hangs():
-    with pytest.raises(CrazyemError, match="did not start: exit code 3"):
-        Simulator(command=command("import sys; sys.exit(3)")).start()
-    with pytest.raises(CrazyemError, match="not get ready"):
-        Simulator(command=command("import time; time.sleep(60)"), timeout=0.5).start()
+@pytest.mark.parametrize(
+    ("script", "says"),
+    [("import sys; sys.exit(3)", "did not start: exit code 3"), ("import time; time.sleep(60)", "not get ready")],
+)
+def test_simulator_that_dies_or_hangs(script, says):
+    with pytest.raises(CrazyemError, match=says):
+        Simulator(command=command(script), timeout=0.5 if "sleep" in script else 60.0).start()
 
 
 def test_simulator_address_is_taken_from_its_ready_line():
@@ -194,22 +172,6 @@ def test_clock_absorbs_a_stall_without_freezing_or_jumping():
     assert rates.min() > 0.7
     assert rates.max() < 1.3
     assert answers[-1][1] == pytest.approx(firmware, abs=0.02)
-
-
-class _BrokenLink:
-    def write_parameter(self, name, value, timeout=1.0):
-        raise RuntimeError("a fault nobody foresaw")
-
-
-def test_a_fault_while_pushing_is_named_and_ends_the_pushing():
-    guard = SimpleNamespace(stopped="")
-    guard.stop = lambda reason: setattr(guard, "stopped", reason)
-    history = History()
-    pusher = Pusher(_BrokenLink(), guard, gate=fake.OPEN, history=history)
-    pusher.submit(Decision(1.0, writes=(("ctrlLee.mass", 0.03), ("ctrlLee.J_x", 1e-5))))
-    pusher.close()
-    assert [p.verified for p in history.pushes] == [False]  # the second write was never tried
-    assert "a fault nobody foresaw" in guard.stopped
 
 
 @pytest.mark.parametrize("count", [0, 7, 8, 9, 40, 1000])

@@ -1,6 +1,5 @@
 """The policy of the guard: the shipped file, files of others, hostile ones, and which URIs are written to unasked."""
 
-import argparse
 import json
 import math
 import threading
@@ -144,8 +143,7 @@ def test_contradictions_are_refused(capsys):
 def test_a_policy_of_a_file_reaches_the_guard(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text("[push]\nslew = 0.05\n")
-    arguments = argparse.Namespace(**vars(parser().parse_args(["fly", "--policy", str(path)])))
-    assert write_rules(arguments).policy.limits.slew == 0.05
+    assert write_rules(parser().parse_args(["fly", "--policy", str(path)])).policy.limits.slew == 0.05
 
 
 @pytest.mark.parametrize(

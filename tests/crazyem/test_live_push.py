@@ -9,6 +9,7 @@ import fake_drone as fake
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from test_guard import NOMINAL, ORIGINALS
 
 from crazyem.errors import LinkError
 from crazyem.links.base import ParameterWrite
@@ -17,12 +18,6 @@ from crazyem.live.guard import Decision, Guard
 from crazyem.live.history import History
 from crazyem.live.push import WRITE_ATTEMPTS, Pusher
 
-NOMINAL = {"mass": 0.029, "Ixx": 1.66e-5, "Iyy": 1.67e-5, "Izz": 2.93e-5}
-ORIGINALS = {
-    "ctrlLee.mass": 0.029, "ctrlLee.J_x": 1.66e-5, "ctrlLee.J_y": 1.67e-5, "ctrlLee.J_z": 2.93e-5,
-    "ctrlLee.KR_x": 0.007, "ctrlLee.KR_y": 0.007, "ctrlLee.KR_z": 0.008,
-    "ctrlLee.Kw_x": 0.00115, "ctrlLee.Kw_y": 0.00115, "ctrlLee.Kw_z": 0.002,
-}  # fmt: skip
 NEW = {"mass": 0.033, "Ixx": 1.9e-5, "Iyy": 1.9e-5, "Izz": 3.3e-5}
 
 
@@ -53,8 +48,8 @@ def a_set(changed=None):
     return Decision(1.0, writes=writes_for(LEE, changed or NEW, beliefs=NOMINAL, originals=ORIGINALS))
 
 
-def run(drone, *decisions, **kw):
-    guard, history = Guard(LEE, nominal=NOMINAL, originals=ORIGINALS), History()
+def run(drone, *decisions, guard=None, **kw):
+    guard, history = guard or Guard(LEE, nominal=NOMINAL, originals=ORIGINALS), History()
     done = []
     pusher = Pusher(drone, guard, gate=fake.OPEN, history=history, timeout=0.01, known=ORIGINALS,
                     on_done=lambda d, why: done.append((d.kind, not why)), **kw)  # fmt: skip
@@ -123,14 +118,21 @@ def test_what_cannot_be_undone_is_said():
     assert drone.attempts == 4 + 2 * WRITE_ATTEMPTS
 
 
-def test_a_link_that_is_gone_costs_one_attempt_each():
-    def gone(name, value, timeout=1.0):
-        raise LinkError("gone.")
+@pytest.mark.parametrize("error", [LinkError("gone."), RuntimeError("a fault nobody foresaw")])
+def test_an_attempt_that_fails_is_named_recorded_and_ends_the_pushing(error):
+    """Without a link: one attempt at the write, and one at its undoing."""
 
-    drone = Drone()
-    drone.write_parameter = gone
-    _, history, _, _ = run(drone, a_set(), wait_for_link=lambda: False)
+    def fails(name, value, timeout=1.0):
+        raise error
+
+    drone, kept = Drone(), []
+    drone.write_parameter = fails
+    guard, history, _, _ = run(drone, a_set(), wait_for_link=lambda: False, on_write=kept.append)
     assert [(p.parameter, p.purpose) for p in history.pushes] == [("ctrlLee.mass", "push"), ("ctrlLee.mass", "undo")]
+    assert [(w.name, w.value, w.echoed, w.verified) for w in kept] == [
+        ("ctrlLee.mass", value, None, False) for value in (NEW["mass"], NOMINAL["mass"])
+    ]
+    assert str(error) in guard.stopped
 
 
 def test_a_stop_before_a_set_drops_it_and_one_within_completes_it():
@@ -143,14 +145,8 @@ def test_a_stop_before_a_set_drops_it_and_one_within_completes_it():
         return write(name, value, timeout)
 
     drone.write_parameter = stop_in_the_middle
-    done = []
-    pusher = Pusher(
-        drone, guard, gate=fake.OPEN, history=History(), known=ORIGINALS, on_done=lambda d, why: done.append(not why)
-    )
-    pusher.submit(a_set())
-    pusher.submit(a_set({"mass": 0.036}))
-    pusher.close()
-    assert done == [True, False]
+    _, _, done, _ = run(drone, a_set(), a_set({"mass": 0.036}), guard=guard)
+    assert done == [("push", True), ("push", False)]
     assert drone.log == list(a_set().writes)
 
 

@@ -1,6 +1,5 @@
 """Several drones: whole commands, with made-up drones and with the simulator."""
 
-import argparse
 import io
 import json
 import math
@@ -9,6 +8,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from fake_drone import FakeEstimator, FakeLink
@@ -114,26 +114,26 @@ def test_what_happens_to_one_drone_does_not_stop_the_others(fake):
     assert "take_off" not in fake["fake://3"].calls
 
 
-def test_drones_that_stand_too_close_do_not_fly_at_all(fake, capsys):
-    fake["fake://1"].wanted = (0.1, 0.0, 0.0)
-    assert main(["fly", *URIS]) == 2
-    assert "drone0 and drone1 stand 0.10 m apart" in capsys.readouterr().err
-    assert not any("take_off" in fake[f"fake://{i}"].calls for i in range(3))
+def two_drones(folder, offset):
+    """The words for a swarm file of a and b."""
+    drone = '[[drone]]\nname = "{}"\nuri = "fake://{}"\n'
+    (folder / "s.toml").write_text(f"{drone.format('a', 0)}offset = {offset}\n{drone.format('b', 1)}")
+    return ["--swarm", "s.toml"]
 
 
-def test_an_offset_that_leads_to_another_drone_is_refused(fake, tmp_path, capsys):
-    (tmp_path / "s.toml").write_text(
-        '[[drone]]\nname = "a"\nuri = "fake://0"\noffset = [1, 0.1, 0]\n[[drone]]\nname = "b"\nuri = "fake://1"\n'
-    )
-    assert main(["fly", "--swarm", "s.toml"]) == 2
-    assert "a and b begin 0.10 m apart" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("offset", "place", "says"),
+    [([0, 0, 0], 0.1, "a and b stand 0.10 m apart"), ([1, 0.1, 0], 1.0, "a and b begin 0.10 m apart")],
+)
+def test_drones_that_come_too_close_do_not_fly_at_all(fake, tmp_path, capsys, offset, place, says):
+    fake["fake://1"].wanted = (place, 0.0, 0.0)
+    assert main(["fly", *two_drones(tmp_path, offset)]) == 2
+    assert says in capsys.readouterr().err
+    assert not any("take_off" in fake[f"fake://{i}"].calls for i in range(2))
 
 
 def test_an_offset_is_where_the_trajectory_is_flown(fake, tmp_path):
-    (tmp_path / "s.toml").write_text(
-        '[[drone]]\nname = "a"\nuri = "fake://0"\noffset = [0, 0.5, 0.25]\n[[drone]]\nname = "b"\nuri = "fake://1"\n'
-    )
-    code, said = flown("--swarm", "s.toml", "--no-push")
+    code, said = flown(*two_drones(tmp_path, [0, 0.5, 0.25]), "--no-push")
     assert code == 0
     assert [d["offset"] for d in said["drones"]] == [[0.0, 0.5, 0.25], [0.0, 0.0, 0.0]]
     assert fake["fake://0"].wanted[:2] == pytest.approx((0.0, 0.5), abs=0.01)
@@ -227,16 +227,9 @@ def test_a_drone_that_never_flew_is_a_row_with_its_reason(fake, monkeypatch):
 
 
 def test_the_table_shows_what_is_not_known():
-    text = command.table(
-        [
-            {"name": "a", "outcome": "failed", "notices": ["why", "said"], "error": "said"},
-            {
-                "name": "b",
-                "outcome": "landed",
-                "estimates": {"mass": {"value": 0.03, "ci95": [0.02, math.inf], "identifiable": False}},
-            },
-        ]
-    )
+    mass = {"value": 0.03, "ci95": [0.02, math.inf], "identifiable": False}
+    failed = {"name": "a", "outcome": "failed", "notices": ["why", "said"], "error": "said"}
+    text = command.table([failed, {"name": "b", "outcome": "landed", "estimates": {"mass": mass}}])
     assert "30.00+->99?" in text
     assert "a: note: why" in text
     assert "note: said" not in text
@@ -251,11 +244,8 @@ def test_the_table_shows_what_is_not_known():
     ],
 )  # fmt: skip
 def test_a_live_view_is_for_terminals(monkeypatch, given, out, err, expected):
-    class Stream:
-        def __init__(self, terminal):
-            self.isatty = lambda: terminal
-
-    monkeypatch.setattr(view, "sys", argparse.Namespace(stdout=Stream(out), stderr=Stream(err)))
+    streams = {"stdout": SimpleNamespace(isatty=lambda: out), "stderr": SimpleNamespace(isatty=lambda: err)}
+    monkeypatch.setattr(view, "sys", SimpleNamespace(**streams))
     monkeypatch.setenv("TERM", "dumb")
     if given != ["--live"]:
         assert view.wants_view(parser().parse_args(["fly", *given])) is False

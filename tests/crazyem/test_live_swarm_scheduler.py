@@ -164,17 +164,13 @@ def test_however_late_an_update_a_second_is_made():
     assert throttle.behind == pytest.approx(5.0)
 
 
-def test_updates_of_several_drones_are_out_of_step():
-    inner = [run_throttled([0.0] * 500, number=i, of=25)[0] for i in range(25)]
-    assert sorted(n for ((_, n), *_) in (i.updates for i in inner)) == [4 + 16 * k for k in range(25)]
+@pytest.mark.parametrize(("drones", "refresh"), [(25, 100), (3, 12)])
+def test_updates_of_several_drones_are_out_of_step(drones, refresh):
+    """The costly passes come every `refresh` updates, evenly spread; for few drones as often as for one."""
+    inner = [run_throttled([0.0] * 500, number=i, of=drones)[0] for i in range(drones)]
+    assert [i.updates[0][1] for i in inner] == [4 + 16 * k for k in range(drones)]
     assert all(n == 4 for i in inner for _, n in i.updates[1:])
-    assert all(i.refresh == 100 for i in inner)  # the costly passes come every four seconds, evenly spread
-
-
-def test_few_drones_make_full_passes_as_often_as_one():
-    inner = [run_throttled([0.0] * 200, number=i, of=3)[0] for i in range(3)]
-    assert [i.updates[0][1] for i in inner] == [4, 4 + 16, 4 + 32]
-    assert all(i.refresh == 12 for i in inner)
+    assert all(i.refresh == refresh for i in inner)
 
 
 def test_a_throttled_estimator_on_time_is_the_estimator_bit_for_bit_and_a_late_one_close_to_it():
