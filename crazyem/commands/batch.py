@@ -30,13 +30,11 @@ def each(
     """Yield the results of `function(*task)` in the order of the tasks; progress goes to standard error.
 
     Args:
-        function: a function at module level, so that other processes can import it; returns a `Result`.
-        tasks: arguments of one call each.
+        function: at module level, so that other processes can import it.
         names: the file of each task; a call that raises becomes a failed result of that name.
-        what: name of the command, for progress.
+        what, unit: name of the command, and plural noun for the tasks, for progress.
         jobs: processes; None: one per core, but none for a single task.
         cluster: address of a Dask scheduler, whose workers see the same files under the same names.
-        unit: plural noun for the tasks, for progress.
 
     Raises: UsageError (no `distributed`, wrong address), LinkError (nothing answers there).
     """
@@ -57,11 +55,9 @@ def on_files(
     *,
     apart: bool = False,
 ) -> None:
-    """Call `work(path, *rest)` for each file of a command, by --jobs and --cluster, and add the results to the report.
+    """Call `work(path, *rest)` for each file and rest, by --jobs and --cluster, and add the results to the report.
 
-    Args:
-        rests: further arguments for each file.
-        apart: whether to put an empty line between two results.
+    apart: whether to put an empty line between two results.
     """
     names = [str(f.path) for f in files.found]
     tasks = [(name, *rest) for name, rest in zip(names, rests)]
@@ -72,10 +68,10 @@ def on_files(
         report.add(result)
 
 
-def close(report: Report, files: Files) -> int:
+def close(report: Report, files: Files, *, apart: bool = False) -> int:
     """Print the count of files if there are several, write the JSON and return the exit code."""
     if len(files.found) > 1 or files.skipped:
-        report.say(counted(report.results, files.skipped))
+        report.say(("\n" if apart else "") + counted(report.results, files.skipped))
     return report.close(skipped_files=files.skipped)
 
 

@@ -19,6 +19,11 @@ def say(line: str) -> None:
     print(f"{line}\n", end="", file=sys.stderr, flush=True)  # one write, so that lines of several threads do not mix
 
 
+def names_in(text: str | None) -> tuple[str, ...]:
+    """The names in a list with commas."""
+    return tuple(name for part in (text or "").split(",") if (name := part.strip()))
+
+
 class LiveLine:
     """Prints a line about a session each second, and keeps phase and seconds for the live view.
 
@@ -101,12 +106,11 @@ def report(arguments: argparse.Namespace, result: FlightResult, *, plot: str | N
         print(text, flush=True)
     if arguments.json:
         write_json({**result.summary, "plot": plot}, arguments.json)
-    files = {"summary": arguments.json} if arguments.json not in (None, "-") else {}
     if plot is not None:
         result.plot(plot)
-        files = {"plot": plot, **files}
-    if files:
-        say("   ".join(f"{what}: {file}" for what, file in files.items()))
+    files = {"plot": plot, "summary": arguments.json if arguments.json != "-" else None}
+    if written := [f"{what}: {file}" for what, file in files.items() if file is not None]:
+        say("   ".join(written))
 
 
 def new_estimator(vehicle: Vehicle, arguments: argparse.Namespace, *, crazyflie: bool = True) -> Any:

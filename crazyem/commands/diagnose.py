@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 from crazyem.atomic_file import write_file
+from crazyem.commands.common import names_in
 from crazyem.commands.files import read_options
 from crazyem.commands.output import deliver
 from crazyem.live.summary import check_writable
@@ -33,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
         held_out=arguments.held_out,
         baseline=arguments.baseline,
         against=arguments.against,
-        candidates=[n.strip() for n in (arguments.candidates or "").split(",") if n.strip()],
+        candidates=names_in(arguments.candidates),
         withhold=arguments.withhold,
         strict_held_out=arguments.strict_held_out,
         jobs=arguments.jobs,

@@ -2,7 +2,7 @@
 
 import glob
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,25 +40,23 @@ class Files:
     skipped: int = 0
 
 
-def find(arguments: Iterable[str], *, mapping: str | None = None) -> Files:
+def find(arguments: Sequence[str], *, mapping: str | None = None) -> Files:
     """Find the recordings given by files, folders (searched recursively) and patterns; each once.
 
     In folders and patterns, files without a known format are counted as skipped; hidden files in folders are ignored.
     A folder that is a recording itself (rosbag2, a cfclient session) counts as one.
 
     Args:
-        arguments: of the command line.
         mapping: --map; with it every CSV file in a folder is a recording, whatever its columns.
 
     Raises: UsageError if there is no recording.
     """
     search = _Search(mapped=mapping is not None)
-    names = list(arguments)
-    for name in names:
+    for name in arguments:
         search.argument(name)
     if not search.found:
         others = f" ({search.skipped} other files)" if search.skipped else ""
-        raise UsageError(f"there is no recording in {', '.join(names)}{others}.")
+        raise UsageError(f"there is no recording in {', '.join(arguments)}{others}.")
     return Files(tuple(search.found), search.skipped)
 
 
@@ -184,7 +182,7 @@ def stem(path: Path) -> str:
         name, lower = name[: -len(suffix)], lower[: -len(suffix)]
 
 
-def targets(found: Iterable[Found], output: str | None, suffix: str, *, force: bool) -> list[Path]:
+def targets(found: Sequence[Found], output: str | None, suffix: str, *, force: bool) -> list[Path]:
     """The target file of each recording's result.
 
     One recording: `output` itself, unless it is an existing folder. Several: `output` is a folder, created if
@@ -192,7 +190,6 @@ def targets(found: Iterable[Found], output: str | None, suffix: str, *, force: b
 
     Raises: UsageError if a result would replace a recording, another result, or (unless `force`) any file.
     """
-    found = list(found)
     inputs = {os.path.realpath(f.path) for f in found}
     if output is not None and len(found) == 1 and not Path(output).is_dir() and not output.endswith(os.sep):
         result = [Path(output)]
@@ -219,7 +216,7 @@ def targets(found: Iterable[Found], output: str | None, suffix: str, *, force: b
     return result
 
 
-def _in_folder(found: list[Found], output: str | None, suffix: str) -> Iterator[Path]:
+def _in_folder(found: Sequence[Found], output: str | None, suffix: str) -> Iterator[Path]:
     if output is not None and Path(output).exists() and not Path(output).is_dir():
         raise UsageError(f"{output} is not a folder; several recordings need one.")
     places = [(f.path.parent if output is None else Path(output) / f.below) for f in found]

@@ -36,9 +36,7 @@ def interrupts(counter: Interrupts | None = None) -> Iterator[Interrupts]:
 def write_rules(arguments: argparse.Namespace, uri: str | None = None, *, name: str = "this drone") -> WriteRules:
     """Policy and mode of the guard: it writes to simulators by default, to drones only with --push or --confirm.
 
-    Args:
-        uri: of the drone; None takes the URI of the command line.
-        name: of the drone, for sentences.
+    uri: of the drone; None takes the URI of the command line. name: of the drone, for sentences.
 
     Raises: UsageError, FileFormatError: the policy cannot be used.
     """

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from crazyem.api.flying import FlightObserver, FlightSettings, Progress, observed_flight
 from crazyem.commands.common import LiveLine, plot_path, report, say
 from crazyem.commands.flights import interrupts, write_rules
-from crazyem.commands.view import Stream, SwarmInterrupts, Viewed, landing, live_stream, live_view, wants_view
+from crazyem.commands.view import Stream, SwarmInterrupts, Viewed, live_stream, live_view, wants_view
 from crazyem.control.named_trajectories import duration_note, trajectory_maker
 from crazyem.errors import CrazyemError
 from crazyem.live.flight import FlightInterruptedError, Interrupts, MotorsCutError
@@ -88,6 +88,6 @@ class _OnTheTerminal(FlightObserver):
     @contextlib.contextmanager
     def progress(self, session: Session, interrupts: Interrupts) -> Iterator[Progress]:
         line = LiveLine(session)
-        shown = [Viewed(session, line, name=session.vehicle.name, land=landing(interrupts))]
+        shown = [Viewed(session, line, name=session.vehicle.name, land=interrupts.land)]
         with live_view(self._view, lambda: shown) as line.quiet:
             yield line

@@ -3,7 +3,7 @@
 import argparse
 from itertools import repeat
 
-from crazyem.commands.batch import counted, on_files, processes
+from crazyem.commands.batch import close, on_files, processes
 from crazyem.commands.files import find, read_options
 from crazyem.commands.merge import merge_inventories
 from crazyem.commands.output import Report, Result
@@ -22,9 +22,7 @@ def run(arguments: argparse.Namespace) -> int:
     jobs = processes(arguments.jobs, len(files.found))
     rest = (options, arguments.vehicle, arguments.parts, jobs, arguments.all)
     on_files(arguments, report, files, inspect, repeat(rest), apart=True)
-    if len(files.found) > 1 or files.skipped:
-        report.say(f"\n{counted(report.results, files.skipped)}")
-    return report.close(skipped_files=files.skipped)
+    return close(report, files, apart=True)
 
 
 def inspect(path: str, options: ReadOptions, vehicle: str | None, parts: bool, jobs: int, everything: bool) -> Result:

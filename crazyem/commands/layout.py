@@ -2,15 +2,13 @@
 
 import argparse
 import json
-import re
 from pathlib import Path
 from typing import Any
 
 from crazyem.atomic_file import write_file
 from crazyem.commands.output import check_json
 from crazyem.errors import UsageError
-
-DRONE_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
+from crazyem.live.swarm import DRONE_NAME, read_swarm
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -36,8 +34,6 @@ def _layout(arguments: argparse.Namespace) -> dict[str, Any]:
     if swarm and names:
         raise UsageError("--swarm names the drones: leave out --drones.")
     if swarm:
-        from crazyem.live.swarm import read_swarm
-
         names = [m.name for m in read_swarm(swarm, vehicle="cf2", trajectory=("hover",))]
     for name in names:
         if not DRONE_NAME.fullmatch(name):

@@ -83,11 +83,8 @@ def _work(left: dict[Any, str], settings: Settings, folder: Path, arguments: arg
         one, calls, names=names, what="paper", jobs=arguments.jobs, cluster=arguments.cluster, unit="simulations"
     ):
         if result.error:
-            say(
-                f"crazyem: {result.file}: {result.error}"
-                if result.file not in result.error
-                else f"crazyem: {result.error}"
-            )
+            where = "" if result.file in result.error else f"{result.file}: "
+            say(f"crazyem: {where}{result.error}")
             code = code or result.code
     return code
 

@@ -3,7 +3,7 @@
 import argparse
 
 from crazyem.atomic_file import write_file
-from crazyem.commands.common import say
+from crazyem.commands.common import names_in, say
 from crazyem.commands.output import put
 from crazyem.errors import CrazyemError, UsageError
 from crazyem.live.summary import check_writable, write_json
@@ -24,12 +24,12 @@ def run(arguments: argparse.Namespace) -> int:
 
     check_writable(arguments.json)
     check_writable(arguments.output)
-    split = _names(arguments.split)
+    split = names_in(arguments.split)
     if arguments.split is not None and len(split) != 2:
         raise UsageError("--split needs two effects, as in rotor_fault,center_of_mass.")
     found = plan(
         arguments.vehicle,
-        parameters=_names(arguments.parameters),
+        parameters=names_in(arguments.parameters),
         split=(split[0], split[1]) if split else None,
         diagnosis=arguments.diagnosis,
         box=tuple(arguments.box),
@@ -49,7 +49,3 @@ def run(arguments: argparse.Namespace) -> int:
     write_file(arguments.output, found.to_toml())
     say(f"plan: {arguments.output}   fly it: crazyem fly --trajectory plan {arguments.output}")
     return 0
-
-
-def _names(text: str | None) -> tuple[str, ...]:
-    return () if text is None else tuple(n for n in (part.strip() for part in text.split(",")) if n)

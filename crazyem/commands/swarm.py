@@ -18,7 +18,7 @@ from typing import Any
 from crazyem.commands.common import LiveLine, compile_kernels, new_estimator, say
 from crazyem.commands.flights import follow, interrupts, write_rules
 from crazyem.commands.output import put
-from crazyem.commands.view import Stream, SwarmInterrupts, Viewed, landing, live_stream, live_view, wants_view
+from crazyem.commands.view import Stream, SwarmInterrupts, Viewed, live_stream, live_view, wants_view
 from crazyem.control.named_trajectories import DEFAULT_HEIGHT, duration_note, trajectory_maker
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links.base import Link
@@ -63,7 +63,6 @@ class Drone:
     stack: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
     session: Session | None = None
     estimator: UpdateThrottle | None = None
-    line: LiveLine | None = None
     shown: Viewed | None = None
     interrupts: Interrupts = field(default_factory=Interrupts)
     error: BaseException | None = None
@@ -132,15 +131,14 @@ def fly(arguments: argparse.Namespace) -> int:
         make = with_offset(trajectory_maker(list(m.trajectory), arguments.duration), m.offset)
         rules = write_rules(arguments, m.uri, name=m.name)
         drone.plan = FlightPlan(make, controller, height=DEFAULT_HEIGHT, push=not arguments.no_push, rules=rules)
-    return _run(arguments, drones, wrench="", work=_fly, before=_check_separation)
+    return _run(arguments, drones)
 
 
 def watch(arguments: argparse.Namespace) -> int:
     """Watch all drones; returns the exit code, that of the first error."""
     if arguments.push or arguments.confirm:
         raise UsageError("several drones at once are watched only: nothing is written to them.")
-    drones = _drones(arguments, members(arguments))
-    return _run(arguments, drones, wrench="ctrlLee", work=functools.partial(_watch, duration=arguments.duration))
+    return _run(arguments, _drones(arguments, members(arguments)))
 
 
 def _drones(arguments: argparse.Namespace, chosen: Sequence[Member]) -> list[Drone]:
@@ -157,14 +155,7 @@ def _drones(arguments: argparse.Namespace, chosen: Sequence[Member]) -> list[Dro
     return drones
 
 
-def _run(
-    arguments: argparse.Namespace,
-    drones: list[Drone],
-    *,
-    wrench: str,
-    work: Callable[[Drone], None],
-    before: Callable[[Sequence[Drone]], None] = lambda drones: None,
-) -> int:
+def _run(arguments: argparse.Namespace, drones: list[Drone]) -> int:
     view = wants_view(arguments)
     compile_kernels(drones[0].vehicle)
     shorten_switch_interval()
@@ -175,14 +166,12 @@ def _run(
         scheduler = Scheduler()
         stack.callback(scheduler.close)
         try:
-            begin = functools.partial(
-                _begin, arguments, of=len(drones), wrench=wrench, stream=stream, scheduler=scheduler
-            )
+            begin = functools.partial(_begin, arguments, of=len(drones), stream=stream, scheduler=scheduler)
             _connect(drones, begin, everyone)
-            before([d for d in drones if d.error is None])
+            _check_separation([d for d in drones if d.plan is not None and d.error is None])
             with live_view(view, lambda: [d.shown for d in drones if d.shown is not None]) as showing:
                 try:
-                    _together(drones, work, quiet=showing)
+                    _together(drones, arguments.duration, quiet=showing)
                 finally:
                     for session in (d.session for d in drones if d.session is not None):
                         session.stop_pushing()  # for all drones, before anything else ends
@@ -214,16 +203,9 @@ def _connect(drones: Sequence[Drone], begin: Callable[[Drone, Link, int], None],
 
 
 def _begin(
-    arguments: argparse.Namespace,
-    drone: Drone,
-    link: Link,
-    number: int,
-    *,
-    of: int,
-    wrench: str,
-    stream: Stream,
+    arguments: argparse.Namespace, drone: Drone, link: Link, number: int, *, of: int, stream: Stream,
     scheduler: Scheduler,
-) -> None:
+) -> None:  # fmt: skip
     m, plan = drone.member, drone.plan
     configuration = {
         "command": arguments.command, "uri": m.uri, "drone": m.name, "of": of, "rate": arguments.rate,
@@ -249,14 +231,13 @@ def _begin(
         append=arguments.append,
         rate=arguments.rate,
         reconnect=arguments.reconnect,
-        wrench=wrench,
+        wrench="" if plan is not None else "ctrlLee",
         wrap=lambda recorder: stream(recorder, m.name),
         scheduler=scheduler,
     )
     estimator.newest = lambda: session.clock.newest
-    drone.line = LiveLine(session, prefix=f"{m.name:<8} ")
-    land = landing(drone.interrupts) if plan is not None else None
-    drone.shown = Viewed(session, drone.line, name=m.name, land=land)
+    land = drone.interrupts.land if plan is not None else None
+    drone.shown = Viewed(session, LiveLine(session, prefix=f"{m.name:<8} "), name=m.name, land=land)
     session.start()
 
 
@@ -281,27 +262,18 @@ def _check_separation(drones: Sequence[Drone]) -> None:
     check_distances(courses)
 
 
-def _fly(drone: Drone) -> None:
-    assert drone.session is not None
-    assert drone.plan is not None
-    Flight(drone.session, drone.plan, interrupts=drone.interrupts, progress=drone.line).fly()
-
-
-def _watch(drone: Drone, *, duration: float | None) -> None:
-    assert drone.session is not None
-    assert drone.line is not None
-    follow(drone.session, drone.interrupts, duration, drone.line)
-
-
-def _together(drones: Sequence[Drone], work: Callable[[Drone], None], *, quiet: Callable[[], bool]) -> None:
-    """Run `work` for each drone in a separate thread; returns when all have ended."""
+def _together(drones: Sequence[Drone], duration: float | None, *, quiet: Callable[[], bool]) -> None:
+    """Fly each drone in a separate thread, or watch it for `duration` [s]; returns when all have ended."""
 
     def one(drone: Drone) -> None:
-        assert drone.line is not None
+        assert drone.session is not None
         assert drone.shown is not None
-        drone.line.quiet = quiet
+        drone.shown.line.quiet = quiet
         try:
-            work(drone)
+            if drone.plan is not None:
+                Flight(drone.session, drone.plan, interrupts=drone.interrupts, progress=drone.shown.line).fly()
+            else:
+                follow(drone.session, drone.interrupts, duration, drone.shown.line)
             drone.outcome = drone.shown.ended = "landed" if drone.plan is not None else "watched"
         except (CrazyemError, FlightInterruptedError, MotorsCutError) as error:
             drone.failed(error)

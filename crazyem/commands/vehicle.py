@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from crazyem.atomic_file import write_file
-from crazyem.commands.common import say
+from crazyem.commands.common import names_in, say
 from crazyem.commands.files import read_options
 from crazyem.commands.output import deliver
 from crazyem.errors import DataError, UsageError
@@ -32,7 +32,7 @@ def _check(arguments: argparse.Namespace) -> int:
         beside=arguments.beside,
         base=arguments.vehicle,
         mass=arguments.mass,
-        candidates=[n.strip() for n in (arguments.candidates or "").split(",") if n.strip()],
+        candidates=names_in(arguments.candidates),
         tolerance=arguments.tolerance,
         jobs=arguments.jobs,
         options=read_options(arguments),

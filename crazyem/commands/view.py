@@ -61,15 +61,6 @@ class SwarmInterrupts(Interrupts):
             one.count = max(one.count, self.count)
 
 
-def landing(one: Interrupts) -> Callable[[], None]:
-    """The function of the landing key; repeated presses never cut the motors."""
-
-    def land() -> None:
-        one.count = max(one.count, 1)
-
-    return land
-
-
 class Viewed:
     """Observer and controls of a running drone for the view."""
 

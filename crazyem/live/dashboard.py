@@ -205,7 +205,6 @@ class Dashboard:
         snapshots: gives the present snapshots; called in the dashboard's thread. An exception in it ends the view, not
             the flight.
         controls: gives the controls of each drone, in the order of the snapshots; called when a key is pressed.
-        console: to draw on. keys: source of keys.
     """
 
     def __init__(

@@ -41,6 +41,10 @@ class Interrupts:
     def __call__(self, *_: object) -> None:
         self.count += 1
 
+    def land(self) -> None:
+        """Land, as the first Ctrl-C does; repeated calls never cut the motors."""
+        self.count = max(self.count, 1)
+
 
 @dataclass(frozen=True)
 class FlightPlan:

@@ -70,16 +70,9 @@ def result_of(
     extra: Mapping[str, Any],
     notices: Iterable[str] = (),
 ) -> FlightResult:
-    """The result of a session that has ended.
+    """The result of a session that has ended; for the arguments see `build_summary`.
 
-    Args:
-        log: path of the recording.
-        received, lost: numbers of log packets; for a foreign recording, of samples.
-        extra: further keys of the summary.
-        notices: further sentences for the user.
-
-    Raises:
-        DataError: there is no flight to estimate from.
+    notices: further sentences for the user. Raises DataError: there is no flight to estimate from.
     """
     history = pipeline.history
     for sentence in notices:

@@ -13,14 +13,6 @@ except ImportError:  # not on Windows: the view works there, without keys
     termios = None  # type: ignore[assignment]
 
 
-def is_terminal(fd: int) -> bool:
-    """Whether a file descriptor is an open terminal."""
-    try:
-        return os.isatty(fd)
-    except (OSError, ValueError):
-        return False
-
-
 class Keys:
     """Single keys within a `with` block. Ctrl-C still raises its signal.
 
@@ -53,7 +45,7 @@ class Keys:
         """Read single keys without echo from now on; does nothing without a terminal."""
         try:
             fd = sys.stdin.fileno() if self._given is None else self._given
-            if termios is None or not is_terminal(fd):
+            if termios is None or not os.isatty(fd):
                 return
             before = termios.tcgetattr(fd)
             now = termios.tcgetattr(fd)

@@ -267,13 +267,5 @@ def _or(value: float, otherwise: float) -> float:
 
 
 def _said(f: Figures) -> str:
-    parts = [
-        text
-        for value, text in (
-            (f.tracking, f"{f.tracking:.3f} m"),
-            (f.innovation, f"{f.innovation:.2f} sd"),
-            (f.oscillation, f"{f.oscillation:.2f} rad/s"),
-        )
-        if not math.isnan(value)
-    ]
-    return ", ".join(parts) or "nothing known"
+    texts = (f"{f.tracking:.3f} m", f"{f.innovation:.2f} sd", f"{f.oscillation:.2f} rad/s")
+    return ", ".join(text for text in texts if not text.startswith("nan")) or "nothing known"

@@ -126,11 +126,7 @@ class PacketPoller:
 
 
 class Scheduler:
-    """Worker threads for all mailboxes, first come, first served, and the receiving thread (`poller`).
-
-    Args:
-        workers: number of threads; None: one for each core.
-    """
+    """Worker threads for all mailboxes (one for each core), first come, first served, and the thread `poller`."""
 
     def __init__(self, workers: int | None = None) -> None:
         self.workers = workers or max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)

@@ -30,8 +30,7 @@ def build_summary(
     """The summary object.
 
     Args:
-        log: path of the recording, or None.
-        estimate: the final one.
+        log: path of the recording.
         update_seconds: cost of each update, s.
         received, lost: log packets (live) or samples (foreign recordings).
         extra: further keys, such as the controller, the seed or the URI.

@@ -33,7 +33,7 @@ LARGEST_OFFSET = 20.0  # m, largest component of an offset
 TRANSIT_SPEED = 0.5  # m/s, mean speed on the way to an offset
 DISTANCE_STEP, MOST_DISTANCE_STEPS = 0.1, 2000  # s between checks of distances along trajectories; most checks
 SWITCH_INTERVAL = 0.0005  # s; the interpreter's 5 ms would be an eighth of an update's budget at every switch
-_DRONE_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
+DRONE_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
 _DRONE_KEYS = ("name", "uri", "vehicle", "trajectory", "offset")
 
 Maker = Callable[[Vector, float], Trajectory]
@@ -68,9 +68,8 @@ def members_of(uris: Sequence[str], *, vehicle: str, trajectory: Sequence[str]) 
     """Drones of the command line. Raises UsageError: too many, or one twice."""
     if len(uris) > MOST_DRONES:
         raise UsageError(f"at most {MOST_DRONES} drones can be flown or watched at once, not {len(uris)}.")
-    double = next((u for i, u in enumerate(uris) if u in uris[:i]), None)
-    if double is not None:
-        raise UsageError(f"{double} is given twice.")
+    if double := _doubles(uris):
+        raise UsageError(f"{double[0]} is given twice.")
     return [Member(f"drone{i}", uri, vehicle, tuple(trajectory)) for i, uri in enumerate(uris)]
 
 
@@ -95,11 +94,13 @@ def read_swarm(path: str | Path, *, vehicle: str, trajectory: Sequence[str]) -> 
         for i, entry in enumerate(entries)
     ]
     for what in ("name", "uri"):
-        values = [getattr(m, what) for m in members]
-        double = next((v for i, v in enumerate(values) if v in values[:i]), None)
-        if double is not None:
-            raise FileFormatError(f"{path}: two drones have the {what} {double}.")
+        if double := _doubles([getattr(m, what) for m in members]):
+            raise FileFormatError(f"{path}: two drones have the {what} {double[0]}.")
     return members
+
+
+def _doubles(values: Sequence[str]) -> list[str]:
+    return [value for i, value in enumerate(values) if value in values[:i]]
 
 
 def _member(entry: Mapping[str, Any], where: str, base: Member, folder: Path) -> Member:
@@ -114,7 +115,7 @@ def _member(entry: Mapping[str, Any], where: str, base: Member, folder: Path) ->
             values[key] = entry[key]
     if "uri" not in values:
         raise FileFormatError(f"{where}: uri is missing.")
-    if not _DRONE_NAME.fullmatch(values.get("name", "a")):
+    if not DRONE_NAME.fullmatch(values.get("name", "a")):
         raise FileFormatError(f"{where}: name must be 1 to 40 letters, digits, - or _, not {values['name']!r}.")
     if "vehicle" in values and (folder / values["vehicle"]).is_file():
         values["vehicle"] = str(folder / values["vehicle"])

@@ -62,7 +62,6 @@ class WriteSupervisor:
 
     Args:
         guard: decides by the estimates.
-        rules: policy, dry run, confirmation.
         originals: parameter values at connect.
         history: gets notices and the account.
         gate: check of every write before it is sent; also used here, to avoid decisions that it would refuse.

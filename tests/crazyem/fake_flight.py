@@ -55,7 +55,7 @@ class Estimator(fake.FakeEstimator):
         return super().feed(sample)
 
 
-class Flown:
+class FakeFlight:
     """A flight of `duration` s; Ctrl-C comes at the ms `interrupt` of firmware time. `plan`: see `FlightPlan`."""
 
     def __init__(self, link, estimator=None, *, trajectory=hover, duration=10.0, controller=LEE, interrupt=(), **plan):
@@ -67,25 +67,29 @@ class Flown:
         def path(position, yaw):
             return trajectory(position=position, yaw=yaw, duration=duration)
 
-        interrupts = Interrupts()
-        flight = Flight(self.session, FlightPlan(path, controller, **plan), interrupts=interrupts)
-        link.follow(self.session, flight)
+        self.interrupts, self._interrupt = Interrupts(), interrupt
+        self.flight = Flight(self.session, FlightPlan(path, controller, **plan), interrupts=self.interrupts)
+        link.follow(self.session, self.flight)
+
+    def fly(self):
+        """From connect to close; `error` is what ended it early."""
         self.session.start()
-        for when in interrupt:
-            threading.Thread(target=self._interrupt, args=(interrupts, when), daemon=True).start()
+        for when in self._interrupt:
+            threading.Thread(target=self._interrupt_at, args=(when,), daemon=True).start()
         try:
-            flight.fly()
+            self.flight.fly()
         except (CrazyemError, FlightInterruptedError, MotorsCutError) as error:
             self.error = error
         finally:
             self.estimator.released.set()
             self.session.close()
-            link.close()
+            self.link.close()
+        return self
 
-    def _interrupt(self, interrupts, when):
+    def _interrupt_at(self, when):
         while self.link.fm < when:
             time.sleep(0.001)
-        interrupts()
+        self.interrupts()
 
     def actions(self):
         return [d["action"] for d in self.history.guard["decisions"]]

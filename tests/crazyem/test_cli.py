@@ -49,13 +49,8 @@ def test_help_is_quick_and_imports_nothing_heavy():
 
 
 def test_options_named_in_the_interface_exist():
-    given = parser().parse_args(
-        [
-            "fly", "--vehicle", "cf2", "--controller", "lqg", "--trajectory", "waypoints", "f.csv", "--duration", "5",
-            "--no-push", "--record", "a.mcap", "--scenario", "s.toml", "--seed", "3", "--speed", "2", "--json", "-",
-            "--plot", "p.png",
-        ]
-    )  # fmt: skip
+    words = "fly --vehicle cf2 --controller lqg --trajectory waypoints f.csv --duration 5 --no-push --record a.mcap"
+    given = parser().parse_args(f"{words} --scenario s.toml --seed 3 --speed 2 --json - --plot p.png".split())
     assert given.trajectory == ["waypoints", "f.csv"]
     assert given.no_push
     assert (given.window, given.every) == (800, 4)

@@ -2,7 +2,7 @@
 
 import pytest
 from fake_drone import FakeLink
-from fake_flight import Estimator, Flown
+from fake_flight import Estimator, FakeFlight
 
 from crazyem.errors import CrazyemError, DataError, LinkError, UsageError
 from crazyem.live.controllers import LQG
@@ -21,7 +21,7 @@ def landed(link):
 
 def test_a_whole_flight_pushes_and_lands():
     link = FakeLink()
-    flown = Flown(link, duration=25.0)
+    flown = FakeFlight(link, duration=25.0).fly()
     assert flown.error is None
     assert order(link) == ["release", "take_off", "setpoint", *3 * ["land", "release"], "stop"]
     assert landed(link)
@@ -41,7 +41,7 @@ def test_a_whole_flight_pushes_and_lands():
 
 def test_without_push_nothing_but_the_controller_choice_is_written():
     link = FakeLink()
-    Flown(link, push=False, duration=5.0)
+    FakeFlight(link, push=False, duration=5.0).fly()
     assert link.values["ctrlLee.mass"] == 0.029
     assert link.writes == 0
     assert landed(link)
@@ -50,12 +50,12 @@ def test_without_push_nothing_but_the_controller_choice_is_written():
 def test_arms_a_drone_that_is_not():
     link = FakeLink()
     link.armed = False
-    Flown(link, duration=2.0)
+    FakeFlight(link, duration=2.0).fly()
     assert link.calls[0] == "arm"
 
 
 def test_an_unconfirmed_write_ends_pushing_but_not_the_flight():
-    flown = Flown(FakeLink(lose_echo_after=2), duration=8.0)
+    flown = FakeFlight(FakeLink(lose_echo_after=2), duration=8.0).fly()
     pushes = flown.history.pushes
     assert [p.verified for p in pushes] == [True, True, False, False]
     assert pushes[3].purpose == "undo"  # of the half-written set: tried, and reported
@@ -77,7 +77,7 @@ def bad_trajectory(**_):
     ],
 )
 def test_what_cannot_be_flown_is_refused_on_the_ground(link, options, says):
-    flown = Flown(FakeLink(**link), **options)
+    flown = FakeFlight(FakeLink(**link), **options).fly()
     assert isinstance(flown.error, UsageError)
     assert says in str(flown.error)
     assert "take_off" not in flown.link.calls
@@ -95,7 +95,7 @@ def test_what_cannot_be_flown_is_refused_on_the_ground(link, options, says):
     ids=["first interrupt", "second interrupt", "link lost", "NaN in a log", "estimator fails"],
 )
 def test_what_ends_a_flight_is_named_and_the_drone_lands_or_is_cut(link, interrupt, fail_at, error, says):
-    flown = Flown(FakeLink(**link), Estimator(fail_at=fail_at), duration=60.0, interrupt=interrupt)
+    flown = FakeFlight(FakeLink(**link), Estimator(fail_at=fail_at), duration=60.0, interrupt=interrupt).fly()
     assert type(flown.error) is error
     assert says in str(flown.error)
     assert flown.link.calls[-1] == "stop"

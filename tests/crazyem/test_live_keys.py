@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from crazyem.live.keys import Keys, is_terminal
+from crazyem.live.keys import Keys
 
 
 @pytest.fixture
@@ -102,7 +102,6 @@ def test_closed_and_missing_files_are_no_terminals(monkeypatch):
     monkeypatch.setattr(sys, "stdin", None)
     with Keys() as keys:
         assert not keys.reading
-    assert not is_terminal(-1)
     with Keys(-1) as keys:
         assert keys.read(60.0) == ""
 

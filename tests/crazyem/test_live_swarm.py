@@ -6,7 +6,6 @@ import math
 import re
 import subprocess
 import sys
-import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -140,42 +139,11 @@ def test_an_offset_is_where_the_trajectory_is_flown(fake, tmp_path):
     assert fake["fake://1"].wanted[:2] == pytest.approx((1.0, 0.0), abs=0.01)
 
 
-@pytest.mark.parametrize(("count", "outcome"), [(1, "landed on request"), (2, "motors cut")])
-def test_one_interrupt_lands_all_and_a_second_one_cuts_all(fake, monkeypatch, count, outcome):
-    everyone, over = [], threading.Event()
-    real = view.SwarmInterrupts
-
-    def caught(ones):
-        everyone.append(real(ones))
-        return everyone[0]
-
-    monkeypatch.setattr(command, "SwarmInterrupts", caught)
-
-    def interrupt():
-        while not all("setpoint" in fake[f"fake://{i}"].calls for i in range(3)):
-            if over.wait(0.01):
-                return  # what it ended with says why
-        for _ in range(count):
-            everyone[0]()
-
-    thread = threading.Thread(target=interrupt)
-    thread.start()
-    code, said = flown(*URIS, "--duration", "600")
-    over.set()
-    thread.join()
-    assert (code, [d["outcome"] for d in said["drones"]]) == (130, [outcome] * 3), said["drones"]
-    for i in range(3):
-        calls = fake[f"fake://{i}"].calls
-        assert calls[-1] == "stop"
-        assert "land" in calls or count == 2
-        assert not fake[f"fake://{i}"].motors
-
-
 def test_landing_by_key_never_cuts_and_control_c_after_it_does_not_either():
     ones = [Interrupts(), Interrupts()]
     everyone = view.SwarmInterrupts(ones)
     for _ in range(3):
-        view.landing(ones[0])()
+        ones[0].land()
     assert [o.count for o in ones] == [1, 0]
     everyone()
     assert [o.count for o in ones] == [1, 1]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import fake_drone as fake
 import pytest
-from fake_flight import Estimator, Flown
+from fake_flight import Estimator, FakeFlight
 
 from crazyem.errors import CrazyemError, LinkError
 from crazyem.estimation.steps import LATEST_DECISION
@@ -34,7 +34,7 @@ def complete(flown):
 
 
 def test_good_writes_are_judged_good_and_kept():
-    flown = Flown(fake.FakeLink())
+    flown = FakeFlight(fake.FakeLink()).fly()
     assert flown.error is None
     assert flown.link.values["ctrlLee.mass"] == pytest.approx(0.036, rel=0.005)
     assert "judged good" in flown.actions()
@@ -47,7 +47,7 @@ def test_good_writes_are_judged_good_and_kept():
 
 
 def test_a_wrong_mass_is_taken_back_and_pushing_ends():
-    flown = Flown(trimmed(), Estimator(WRONG), duration=14.0)
+    flown = FakeFlight(trimmed(), Estimator(WRONG), duration=14.0).fly()
     assert flown.error is None
     assert max(p.value for p in flown.history.pushes if p.parameter == "ctrlLee.mass") > 0.0413
     assert flown.link.values["ctrlLee.mass"] == pytest.approx(0.036)
@@ -64,7 +64,7 @@ def test_a_wrong_mass_is_taken_back_and_pushing_ends():
 def test_without_the_watch_it_stays():
     """The scenario above tests something: nothing else in the guard would have noticed."""
     rules = WriteRules(Policy(watch=MonitorLimits(enabled=False)))
-    flown = Flown(trimmed(), Estimator(WRONG), rules=rules, duration=14.0)
+    flown = FakeFlight(trimmed(), Estimator(WRONG), rules=rules, duration=14.0).fly()
     assert flown.link.values["ctrlLee.mass"] == pytest.approx(WRONG["mass"], rel=0.01)
 
 
@@ -80,14 +80,14 @@ def test_a_stalled_estimator_does_not_blind_the_watch():
         return write(name, value, timeout)
 
     link.write_parameter = stall_after_mass
-    flown = Flown(link, estimator, duration=16.0)
+    flown = FakeFlight(link, estimator, duration=16.0).fly()
     assert estimator.stall_at == 0
     assert flown.link.values["ctrlLee.mass"] == pytest.approx(0.036)
     assert complete(flown)
 
 
 def test_a_dry_run_decides_and_writes_nothing():
-    flown = Flown(fake.FakeLink(), rules=WriteRules(dry_run=True))
+    flown = FakeFlight(fake.FakeLink(), rules=WriteRules(dry_run=True)).fly()
     assert flown.link.writes == 0
     assert flown.history.pushes == []
     would = [d for d in flown.history.guard["decisions"] if d["action"] == "would write"]
@@ -104,7 +104,7 @@ def test_confirmation_is_asked_for_once(answer):
         questions.append(question)
         return answer
 
-    flown = Flown(fake.FakeLink(), rules=WriteRules(confirm=confirm))
+    flown = FakeFlight(fake.FakeLink(), rules=WriteRules(confirm=confirm)).fly()
     assert len(questions) == 1
     assert "ctrlLee.mass = 0.03335" in questions[0]
     assert bool(flown.link.writes) is answer
@@ -118,7 +118,7 @@ def test_a_question_nobody_answers_writes_nothing_and_holds_up_nothing():
         ended.wait(60.0)
         return True  # too late
 
-    flown = Flown(fake.FakeLink(), rules=WriteRules(confirm=confirm))
+    flown = FakeFlight(fake.FakeLink(), rules=WriteRules(confirm=confirm)).fly()
     assert flown.error is None
     assert flown.link.writes == 0
 
@@ -128,7 +128,7 @@ def test_an_empty_battery_is_left_alone():
         def value(self, name):
             return 3100.0 if name == "pm.vbatMV" else super().value(name)
 
-    flown = Flown(Empty())
+    flown = FakeFlight(Empty()).fly()
     assert flown.link.writes == 0
     assert any("3.10 V, below 3.2 V" in d["reason"] for d in flown.history.guard["decisions"])
 
@@ -136,7 +136,7 @@ def test_an_empty_battery_is_left_alone():
 @pytest.mark.parametrize(("rule", "mass"), [("restore", 0.029), ("good", 0.036), ("keep", 0.036)])
 def test_after_a_failure_the_policy_decides_what_stays(rule, mass):
     rules = WriteRules(Policy(end=EndRules(failed=rule)))
-    flown = Flown(fake.FakeLink(), Estimator(fail_at=1300), rules=rules, duration=60.0)
+    flown = FakeFlight(fake.FakeLink(), Estimator(fail_at=1300), rules=rules, duration=60.0).fly()
     assert isinstance(flown.error, CrazyemError)
     assert not [p for p in flown.history.pushes if not p.verified]
     assert "judged good" in flown.actions()
@@ -155,7 +155,7 @@ def test_restoring_waits_until_the_drone_is_down():
         return write(name, value, timeout)
 
     link.write_parameter = watched
-    flown = Flown(link, rules=WriteRules(Policy(end=EndRules(landed="restore"))))
+    flown = FakeFlight(link, rules=WriteRules(Policy(end=EndRules(landed="restore")))).fly()
     assert seen[-1] == (0.029, False)
     for name, value in flown.history.guard["at_connect"].items():
         assert link.values[name] == pytest.approx(value, rel=1e-6)
@@ -163,11 +163,11 @@ def test_restoring_waits_until_the_drone_is_down():
 
 @pytest.mark.parametrize("times", [(11000,), (11000, 11300)])
 def test_ctrl_c_keeps_by_default_and_restores_if_told(times):
-    flown = Flown(fake.FakeLink(), interrupt=times, duration=60.0)
+    flown = FakeFlight(fake.FakeLink(), interrupt=times, duration=60.0).fly()
     assert isinstance(flown.error, FlightInterruptedError if len(times) == 1 else MotorsCutError)
     assert flown.link.values["ctrlLee.mass"] > 0.03
     rules = WriteRules(Policy(end=EndRules(interrupted="restore")))
-    flown = Flown(fake.FakeLink(), interrupt=times, duration=60.0, rules=rules)
+    flown = FakeFlight(fake.FakeLink(), interrupt=times, duration=60.0, rules=rules).fly()
     assert not flown.link.motors
     assert flown.link.values["ctrlLee.mass"] == pytest.approx(0.029)
 
@@ -182,16 +182,16 @@ def test_over_a_lost_link_nothing_is_put_back_and_that_is_said():
         return write(name, value, timeout)
 
     link.write_parameter = gone
-    flown = Flown(link, duration=60.0)
+    flown = FakeFlight(link, duration=60.0).fly()
     assert isinstance(flown.error, LinkError)
     assert {p.purpose for p in flown.history.pushes} == {"push"}
     assert any("were not written back: no telemetry comes" in n for n in flown.history.notices)
 
 
 def test_nothing_is_put_back_that_was_never_pushed():
-    flown = Flown(
+    flown = FakeFlight(
         fake.FakeLink(), interrupt=(3000,), duration=60.0, rules=WriteRules(Policy(end=EndRules("restore", "restore")))
-    )
+    ).fly()
     assert flown.link.writes == 0
     assert "restore" not in flown.actions()
 

@@ -112,7 +112,7 @@ def test_a_watch_whose_estimator_is_behind_writes_nothing_once_it_is_left(monkey
 
 
 @pytest.mark.parametrize("way", ["landed", "first Ctrl-C", "second Ctrl-C", "estimator fails", "link lost"])
-def test_a_swarm_writes_in_the_air_only_and_begins_no_set_once_it_is_left(monkeypatch, way):
+def test_a_swarm_writes_in_the_air_only_and_begins_no_set_once_it_is_left(monkeypatch, capsys, way):
     links = {f"fake://{i}": Watched(speed=40.0) for i in range(2)}
     everyone, sessions = [], []
     sets = dict.fromkeys(links, 0)  # sets of writes that were begun
@@ -167,4 +167,7 @@ def test_a_swarm_writes_in_the_air_only_and_begins_no_set_once_it_is_left(monkey
         link, purposes = session.link, [p.purpose for p in session.history.pushes]
         assert [purpose != "restore" for purpose in purposes] == link.sent  # whether in the air
         assert sets[link.uri] == 2 or "Ctrl-C" in way  # which is for all, also for one that had less time
+        assert (link.calls[-1], link.motors) == ("stop", False)
+    if "Ctrl-C" in way:
+        assert capsys.readouterr().out.count("motors cut" if "second" in way else "landed on request") == 2
     assert max(sets.values()) == 2 or way == "landed"

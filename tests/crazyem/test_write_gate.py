@@ -9,12 +9,11 @@ from types import SimpleNamespace
 
 import fake_drone as fake
 import pytest
+from fake_flight import FakeFlight
 from test_live_push import NOMINAL, ORIGINALS, Drone, a_set
 
-from crazyem.control.trajectories import hover
 from crazyem.live.attach import Attachment
 from crazyem.live.controllers import LEE
-from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
 from crazyem.live.guard import Decision, Guard
 from crazyem.live.history import History
 from crazyem.live.policy import EndRules, Policy
@@ -309,36 +308,25 @@ class Watched(fake.FakeLink):
 @pytest.mark.parametrize("way", ["landed", "first Ctrl-C", "second Ctrl-C", "estimator fails", "link lost"])
 def test_a_flight_writes_in_the_air_only_and_restores_on_the_ground(way):
     link = Watched(speed=40.0, lost_at=9000 if way == "link lost" else None)
-    session = Session(link, vehicle=load_vehicle("cf2"), estimator=fake.FakeEstimator())
     rules = WriteRules(Policy(end=EndRules(*["restore"] * 4)))
-    plan = FlightPlan(lambda position, yaw: hover(position=position, yaw=yaw, duration=4.0), LEE, rules=rules)
-    interrupts = Interrupts()
-    flight = Flight(session, plan, interrupts=interrupts)
-    link.follow(session, flight)
-    session.start()
+    flown = FakeFlight(link, duration=4.0, rules=rules)
     write = link.write_parameter
 
     def write_and_end(name, value, timeout=1.0):
         if name == "ctrlLee.mass":
-            interrupts.count = {"first Ctrl-C": 1, "second Ctrl-C": 2}.get(way, 0)
-            session.pipeline.estimator.error = ValueError("boom") if way == "estimator fails" else None
+            flown.interrupts.count = {"first Ctrl-C": 1, "second Ctrl-C": 2}.get(way, 0)
+            flown.estimator.fail_at = 300 if way == "estimator fails" else None
         return write(name, value, timeout)
 
     link.write_parameter, stop, cut = write_and_end, link.stop, []
 
     def stop_motors():
-        cut.append(session.write_supervisor.gate.motors_cut)
+        cut.append(flown.session.write_supervisor.gate.motors_cut)
         stop()
 
     link.stop = stop_motors
-    try:
-        flight.fly()
-    except (FlightInterruptedError, MotorsCutError, Exception):
-        assert way != "landed"
-    finally:
-        session.close()
-        link.close()
-    pushes = [p.purpose for p in session.history.pushes]
+    assert (flown.fly().error is None) is (way == "landed")
+    pushes = [p.purpose for p in flown.history.pushes]
     assert "push" in pushes
     assert len(link.sent) == len(pushes)
     for purpose, air in zip(pushes, link.sent, strict=True):
