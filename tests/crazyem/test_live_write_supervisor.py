@@ -6,7 +6,7 @@ import fake_drone as fake
 import pytest
 from fake_flight import Estimator, FakeFlight
 
-from crazyem.errors import CrazyemError, LinkError
+from crazyem.errors import CrazyemError
 from crazyem.estimation.steps import LATEST_DECISION
 from crazyem.live.flight import FlightInterruptedError, MotorsCutError
 from crazyem.live.policy import EndRules, HealthLimits, MonitorLimits, Policy
@@ -145,47 +145,13 @@ def test_after_a_failure_the_policy_decides_what_stays(rule, mass):
     assert complete(flown)
 
 
-def test_restoring_waits_until_the_drone_is_down():
-    link = fake.FakeLink()
-    write, seen = link.write_parameter, []
-
-    def watched(name, value, timeout=1.0):
-        if name == "ctrlLee.mass":
-            seen.append((value, link.motors))
-        return write(name, value, timeout)
-
-    link.write_parameter = watched
-    flown = FakeFlight(link, rules=WriteRules(Policy(end=EndRules(landed="restore")))).fly()
-    assert seen[-1] == (0.029, False)
-    for name, value in flown.history.guard["at_connect"].items():
-        assert link.values[name] == pytest.approx(value, rel=1e-6)
-
-
-@pytest.mark.parametrize("times", [(11000,), (11000, 11300)])
-def test_ctrl_c_keeps_by_default_and_restores_if_told(times):
+@pytest.mark.parametrize(
+    ("times", "error"), [((11000,), FlightInterruptedError), ((11000, 11300), MotorsCutError)], ids=["first", "second"]
+)
+def test_ctrl_c_keeps_by_default(times, error):
     flown = FakeFlight(fake.FakeLink(), interrupt=times, duration=60.0).fly()
-    assert isinstance(flown.error, FlightInterruptedError if len(times) == 1 else MotorsCutError)
+    assert isinstance(flown.error, error)
     assert flown.link.values["ctrlLee.mass"] > 0.03
-    rules = WriteRules(Policy(end=EndRules(interrupted="restore")))
-    flown = FakeFlight(fake.FakeLink(), interrupt=times, duration=60.0, rules=rules).fly()
-    assert not flown.link.motors
-    assert flown.link.values["ctrlLee.mass"] == pytest.approx(0.029)
-
-
-def test_over_a_lost_link_nothing_is_put_back_and_that_is_said():
-    link = fake.FakeLink(lost_at=12000)
-    write = link.write_parameter
-
-    def gone(name, value, timeout=1.0):
-        if link.fm > 12000:
-            raise LinkError("gone.")
-        return write(name, value, timeout)
-
-    link.write_parameter = gone
-    flown = FakeFlight(link, duration=60.0).fly()
-    assert isinstance(flown.error, LinkError)
-    assert {p.purpose for p in flown.history.pushes} == {"push"}
-    assert any("were not written back: no telemetry comes" in n for n in flown.history.notices)
 
 
 def test_nothing_is_put_back_that_was_never_pushed():

@@ -305,8 +305,12 @@ class Watched(fake.FakeLink):
         return super().write_parameter(name, value, timeout)
 
 
-@pytest.mark.parametrize("way", ["landed", "first Ctrl-C", "second Ctrl-C", "estimator fails", "link lost"])
-def test_a_flight_writes_in_the_air_only_and_restores_on_the_ground(way):
+@pytest.mark.parametrize(
+    ("way", "outcome"),
+    [("landed", "landed"), ("first Ctrl-C", "interrupted"), ("second Ctrl-C", "interrupted"),
+     ("estimator fails", "failed"), ("link lost", "link_lost")],
+)  # fmt: skip
+def test_a_flight_writes_in_the_air_only_and_restores_on_the_ground(way, outcome):
     link = Watched(speed=40.0, lost_at=9000 if way == "link lost" else None)
     rules = WriteRules(Policy(end=EndRules(*["restore"] * 4)))
     flown = FakeFlight(link, duration=4.0, rules=rules)
@@ -332,6 +336,13 @@ def test_a_flight_writes_in_the_air_only_and_restores_on_the_ground(way):
     for purpose, air in zip(pushes, link.sent, strict=True):
         assert air is (purpose != "restore")
     assert ("restore" in pushes) is (way != "link lost")
+    if way == "link lost":
+        assert any("were not written back: no telemetry comes" in n for n in flown.history.notices)
+    else:
+        before = flown.history.guard["at_connect"]
+        assert {name: link.values[name] for name in before} == pytest.approx(before, rel=1e-6)
+        asked = [d["reason"] for d in flown.history.guard["decisions"] if d["action"] == "restore"]
+        assert asked == [f"{outcome}: restore"]
     assert cut[0] is (way in ("second Ctrl-C", "link lost"))  # known before the motors stop, not 0.3 s after
 
 
