@@ -1,5 +1,6 @@
 """Simulator files for scripts and notebooks: convert them, check them with flights, and draw vehicles."""
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from crazyem.diagnosis.prediction.predict import recorded
 from crazyem.errors import DataError, UsageError
 from crazyem.notebook import finite, html_table
 from crazyem.recordings.contents import ReadOptions
+from crazyem.recordings.recording import Recording
 from crazyem.simulators.constants import NUMBERS
 from crazyem.simulators.convert import Conversion, convert, load_source, read_text
 from crazyem.simulators.cost import HORIZON, errors_after, said
@@ -164,22 +166,18 @@ def check_vehicle(
     if source.imported is None:
         raise UsageError(f"{file}: this is no simulator's file; diagnose judges vehicle files.")
     others = [load_source(other, name=name, base=lacking, strict=False) for other in beside]
-    found = diagnose(
-        flown, source.vehicle, held_out=kept, candidates=candidates, jobs=jobs, progress=progress,
-    )  # fmt: skip
+    found = diagnose(flown, source.vehicle, held_out=kept, candidates=candidates, jobs=jobs, progress=progress)
     fitted = found.fitted_vehicle if mass is None else rescaled(found.fitted_vehicle, mass)
     findings = _field_findings(source.imported, source.vehicle, fitted, found.document, tolerance)
-    corrected = convert(
-        fitted, source.format, template=source.text, where=str(file), name=source.imported.name,
-        flight=(kept or flown)[0],
-    )  # fmt: skip
     judges = kept or flown
+    where, drone = str(file), source.imported.name
+    corrected = convert(fitted, source.format, template=source.text, where=where, name=drone, flight=judges[0])
     vehicles = {"before": source.vehicle, "after": corrected.held, "fitted": fitted}
     choices = alternatives(source.imported, fitted, source.vehicle.mass) if mass is None else []
     return VehicleCheck(
         source.imported, source.vehicle, found, tuple(findings), tuple(choices),
         tuple(d for other in others if other.imported for d in disagreements(source.imported, other.imported)),
-        corrected, _pooled([e for e in (_errors(r, vehicles) for r in judges) if e]), tuple(r.path for r in judges),
+        corrected, _pooled(judges, vehicles), tuple(r.path for r in judges),
     )  # fmt: skip
 
 
@@ -259,15 +257,12 @@ def disagreements(first: SimulatorFile, second: SimulatorFile) -> list[str]:
     return found
 
 
-def _errors(recording: Any, vehicles: Mapping[str, Vehicle]) -> dict[str, dict[str, float]] | None:
-    try:
-        return errors_after(recording, vehicles)
-    except DataError:
-        return None
-
-
-def _pooled(errors: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
-    """Root mean square of the errors over flights. Raises DataError if there is no flight."""
+def _pooled(recordings: Sequence[Recording], vehicles: Mapping[str, Vehicle]) -> dict[str, dict[str, float]]:
+    """Root mean square of the errors over flights. Raises DataError if no flight has errors."""
+    errors = []
+    for recording in recordings:
+        with contextlib.suppress(DataError):
+            errors.append(errors_after(recording, vehicles))
     if not errors:
         raise DataError("no flight is long enough and has whole states, so open-loop errors cannot be told")
     return {

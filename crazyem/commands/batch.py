@@ -88,14 +88,8 @@ def counted(results: Sequence[Result], skipped: int) -> str:
 
 def processes(jobs: int | None, files: int) -> int:
     """Number of files processed in parallel: `jobs`, else one per core, and never more than `files`."""
-    return min(jobs or _cores(), files)
-
-
-def _cores() -> int:
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on every system
-        return os.cpu_count() or 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(jobs or cores, files)
 
 
 def _results(calls: list[Any], jobs: int | None, cluster: str | None, stack: contextlib.ExitStack) -> Iterator[Result]:

@@ -115,14 +115,9 @@ def _what(finding: Finding) -> str:
 
 
 def _result(
-    path: str,
-    source: str,
-    duration: float,
-    findings: tuple[Finding, ...],
-    fixed: dict[str, Any],
-    lines: list[str],
+    path: str, source: str, duration: float, findings: tuple[Finding, ...], fixed: dict[str, Any], lines: list[str],
     detail: Any,
-) -> Result:
+) -> Result:  # fmt: skip
     grade = next((g for g in _WORST_FIRST if any(f.grade is g for f in findings)), None)
     data: dict[str, Any] = {
         "source": source,
@@ -163,13 +158,9 @@ def _when(finding: Finding) -> str:
 
 def _wrapped(text: str, indent: str = " " * 12) -> str:
     return textwrap.fill(
-        text,
-        _TEXT_WIDTH,
-        initial_indent=indent,
-        subsequent_indent=indent + "  ",
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+        text, _TEXT_WIDTH, initial_indent=indent, subsequent_indent=indent + "  ",
+        break_long_words=False, break_on_hyphens=False,
+    )  # fmt: skip
 
 
 def _graded(results: list[Result]) -> str:

@@ -85,8 +85,13 @@ class _Search:
     def _matched(self, path: Path) -> None:
         if path.is_dir():
             self._folder(path)
-        elif path.is_file() and _is_recording(path, mapped=self.mapped):
-            self._take(path, "")
+        else:
+            self._file(path, "")
+
+    def _file(self, path: Path, below: str) -> None:
+        """Take a file if it is a recording, else count it as skipped. Nothing else is opened: a pipe would block."""
+        if os.path.isfile(path) and _is_recording(path, mapped=self.mapped):
+            self._take(path, below)
         else:
             self.skipped += 1
 
@@ -117,10 +122,8 @@ class _Search:
                         self._take(path, _below(folder, top))
                     else:
                         inner.append(path)
-                elif os.path.isfile(path) and _is_recording(path, mapped=self.mapped):
-                    self._take(path, _below(folder, top))
                 else:
-                    self.skipped += 1
+                    self._file(path, _below(folder, top))
             waiting.extend(reversed(inner))
 
     def _take(self, path: Path, below: str) -> None:
