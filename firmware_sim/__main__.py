@@ -2,14 +2,14 @@
 
 import argparse
 import contextlib
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from firmware_sim.errors import FirmwareSimError, ServerError
-from firmware_sim.firmware import Firmware
+from firmware_sim.errors import FirmwareSimError
+from firmware_sim.firmware import boot
 from firmware_sim.server import Server, bind
+from firmware_sim.start import open_truth, stop_on_signals
 from firmware_sim.wire import Air
 
 
@@ -60,6 +60,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments.storage and (arguments.swarm is not None or arguments.mavlink is not None):
             other = "--mavlink" if arguments.mavlink is not None else "--swarm"
             raise FirmwareSimError(f"--storage is for one Crazyflie: leave it out with {other}")
+        if arguments.seed < 0:
+            raise FirmwareSimError(f"--seed must not be negative, it is {arguments.seed}")
         if arguments.mavlink is not None:
             from firmware_sim.mavlink.server import run as run_mavlink
 
@@ -77,39 +79,18 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    if arguments.seed < 0:
-        raise FirmwareSimError(f"--seed must not be negative, it is {arguments.seed}")
     with contextlib.ExitStack() as stack:
         sock = stack.enter_context(contextlib.closing(bind(arguments.host, arguments.port)))
-        from firmware_sim.flight import Flight  # late: compiled code loads slowly, a port in use is told first
-        from firmware_sim.scenario import load_scenario
+        from firmware_sim.scenario import load_scenario  # late: compiled code loads slowly, a port in use is told first
         from firmware_sim.services.memory import Storage
 
         scenario = load_scenario(arguments.scenario)
         storage = Storage(arguments.storage)
-        truth = None
-        if arguments.truth:
-            try:
-                truth = stack.enter_context(arguments.truth.open("w", encoding="utf-8"))
-            except OSError as error:
-                raise ServerError(f"cannot write {arguments.truth}: {error.strerror}") from None
-        flight = Flight(scenario, arguments.seed)
-        firmware = Firmware(
-            flight,
-            platform=scenario.platform,
-            seed=arguments.seed,
-            parameters=scenario.parameters,
-            storage=storage,
-        )
-        firmware.advance(1)  # compiles what is not compiled yet, before the clock starts
+        truth = open_truth(arguments.truth, stack)
+        firmware = boot(scenario, arguments.seed, storage)
         air = Air(scenario.link.loss, scenario.link.burst, arguments.seed)
         server = Server(firmware, sock, speed=arguments.speed, truth=truth, air=air)
-
-        def stop(_signal: int, _frame: object) -> None:
-            server.stopping = True
-
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, stop)
+        stop_on_signals(server)
         host, port = sock.getsockname()
         print(f"firmware_sim: udp://{host}:{port} platform {scenario.platform} seed {arguments.seed}", flush=True)
         server.run()
@@ -118,8 +99,6 @@ def _run(arguments: argparse.Namespace) -> None:
 def _run_swarm(arguments: argparse.Namespace) -> None:
     from firmware_sim import swarm
 
-    if arguments.seed < 0:
-        raise FirmwareSimError(f"--seed must not be negative, it is {arguments.seed}")
     if arguments.truth:
         raise FirmwareSimError("--truth is for one drone: leave it out with --swarm")
     options = {"port": arguments.port, "seed": arguments.seed, "scenario": arguments.scenario}
@@ -128,12 +107,7 @@ def _run_swarm(arguments: argparse.Namespace) -> None:
     drones = swarm.of_number(int(text), **options) if digits else swarm.of_file(Path(text), **options)
     with contextlib.ExitStack() as stack:
         running = swarm.open_swarm(drones, stack, host=arguments.host, speed=arguments.speed)
-
-        def stop(_signal: int, _frame: object) -> None:
-            running.stopping = True
-
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, stop)
+        stop_on_signals(running)
         print(f"firmware_sim: {len(drones)} drones are ready", flush=True)
         running.run()
 

@@ -4,10 +4,8 @@ It has no sockets and no real time: `receive` takes a packet, `advance` lets tim
 """
 
 from collections import deque
-from collections.abc import Mapping
-from typing import ClassVar, Protocol
-
-import numpy as np
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 from firmware_sim import contents, tables, wire
 from firmware_sim.commander.decode import RpytDecoder
@@ -23,7 +21,10 @@ from firmware_sim.services.log import DATA, LogService
 from firmware_sim.services.memory import MemoryService, Storage
 from firmware_sim.services.param import ParamService
 from firmware_sim.services.ports import FIRMWARE_VERSION, PlatformService
-from firmware_sim.tables import Slot
+
+if TYPE_CHECKING:
+    from firmware_sim.flight import Flight
+    from firmware_sim.scenario import Scenario
 
 # Log variables that are constant here and not 0 for a drone at rest: rates [Hz] of the loops, and the state of the
 # complementary estimator, which does not run.
@@ -39,33 +40,7 @@ _CONSTANT_LOG = {
 }
 
 
-class FlightLike(Protocol):
-    """The part of a flight that the firmware uses (flight.Flight; tests have their own class)."""
-
-    tick: int
-    log: dict[str, Slot]
-    param: dict[str, Slot]
-    param_defaults: dict[str, float]
-    setpoint: np.ndarray
-    motors_allowed: bool
-    armed: bool
-    flying: bool
-    truth_header: ClassVar[list[str]]
-
-    def truth_row(self) -> list[float]:
-        """The true state now, in the columns of truth_header."""
-
-    def parameter_written(self, name: str) -> None:
-        """A parameter of the flight has been written."""
-
-    def external_position(self, position: np.ndarray) -> None:
-        """A position fix from outside, m, world."""
-
-    def external_pose(self, position: np.ndarray, quaternion: np.ndarray) -> None:
-        """A pose from outside, m, world; quaternion x, y, z, w, body to world."""
-
-    def step(self) -> None:
-        """One millisecond."""
+Service = Callable[[int, bytes], list[tuple[int, bytes]]]  # channel, data -> replies: channel, data
 
 
 class Firmware:
@@ -84,14 +59,14 @@ class Firmware:
 
     def __init__(
         self,
-        flight: FlightLike,
+        flight: "Flight",
         *,
         platform: str,
         seed: int,
         parameters: Mapping[str, float] | None = None,
         storage: Storage | None = None,
     ):
-        boot = contents.defaults(list(contents.PARAMETERS), platform)
+        boot_values = contents.defaults(list(contents.PARAMETERS), platform)
         self.flight = flight
         self.outbox: deque[tuple[bytes, bool]] = deque()  # datagram, and whether it may be dropped
         self._console: list[str] = []
@@ -102,7 +77,7 @@ class Firmware:
         self.high_level = HighLevelService(flight.log, self._tick)
         self.arbiter = Arbiter(low_level=self.high_level.planner.stop, relaxed=self.high_level.set_state)
         own_log = tables.slots(dict.fromkeys(contents.LOG, 0.0) | _CONSTANT_LOG)
-        own_param = tables.slots(boot | dict.fromkeys(tables.DECKS, 0.0))
+        own_param = tables.slots(boot_values | dict.fromkeys(tables.DECKS, 0.0))
         log = {**own_log, **self.supervisor.log, **flight.log}
         param = {**own_param, **self.supervisor.param, **self.high_level.param, **flight.param}
         # A parameter that the flight also has is the one of the flight everywhere.
@@ -110,7 +85,7 @@ class Firmware:
         self._rates = (own_log["crtp.rxRate"], own_log["crtp.txRate"])
         self._packets = [0, 0]  # received and sent since the last update of the rates
 
-        defaults = boot | flight.param_defaults
+        defaults = boot_values | flight.param_defaults
         self.log = LogService(tables.log_table(log), seed)
         self.param = ParamService(tables.param_table(param), defaults, self._written, storage or Storage())
         self.memory = MemoryService(self.high_level.memory, own_log["memTst.errCntW"])
@@ -118,57 +93,48 @@ class Firmware:
         self.localisation = LocalisationService(flight.external_position, flight.external_pose, self.supervisor)
         mode = {name.split(".")[1]: slot for name, slot in param.items() if name.startswith("flightmode.")}
         self.setpoints = SetpointService(self.arbiter, RpytDecoder(lambda name: float(mode[name][0][mode[name][1]])))
+        self._services = self._by_port()
         for name, value in (parameters or {}).items():
             item = self.param.table.by_name.get(name)
             if item is None:
                 raise ScenarioError(f"the scenario sets the parameter {name}, which this firmware does not have")
             self.param.set(item, value)
         self.param.restore()
-        self._say("SYS: ----------------------------\n")
-        self._say(f"SYS: {platform} is up and running!\n")
-        self._say(f"SYS: {FIRMWARE_VERSION}\n")
-        self._say("SYS: Crazyflie firmware simulator: no drone here\n")
+        first = ("-" * 28, f"{platform} is up and running!", FIRMWARE_VERSION)
+        self._console += [f"SYS: {line}\n" for line in (*first, "Crazyflie firmware simulator: no drone here")]
 
     # Packets.
 
     def receive(self, packet: wire.Packet) -> None:
         """Handle one packet from the client; its replies are put in the outbox, exactly once and in order."""
         self._packets[0] += 1
-        for channel, data in self._dispatch(packet):
-            self._send(wire.encode(packet.port, channel, data))
+        if packet.port in self._services:
+            for channel, data in self._services[packet.port](packet.channel, packet.data):
+                self._send(wire.encode(packet.port, channel, data))
         self._flush_console()
 
-    def _dispatch(self, packet: wire.Packet) -> list[tuple[int, bytes]]:
-        port, channel, data = packet
-        tick, allowed = self.flight.tick, self.supervisor.can_fly
-        if port == wire.LINK:
-            return ports.link(channel, data)
-        if port == wire.PARAM:
-            return self.param.handle(channel, data)
-        if port == wire.LOG:
-            return self.log.handle(channel, data, tick)
-        if port == wire.SETPOINT_GENERIC:
-            return self.setpoints.handle_generic(channel, data, tick, allowed=allowed)
-        if port == wire.SETPOINT:
-            return self.setpoints.handle_rpyt(channel, data, tick, allowed=allowed)
-        if port == wire.SETPOINT_HIGH_LEVEL:
-            return self.high_level.handle(channel, data)
-        if port == wire.LOCALISATION:
-            return self.localisation.handle(channel, data)
-        if port == wire.SUPERVISOR:
-            return ports.supervise(self.supervisor, channel, data)
-        if port == wire.MEMORY:
-            return self.memory.handle(channel, data)
-        if port == wire.PLATFORM:
-            return self.platform.handle(channel, data)
-        return []
+    def _by_port(self) -> dict[int, Service]:
+        flight, supervisor, setpoints = self.flight, self.supervisor, self.setpoints
+        return {
+            wire.LINK: ports.link,
+            wire.PARAM: self.param.handle,
+            wire.LOG: lambda channel, data: self.log.handle(channel, data, flight.tick),
+            wire.SETPOINT_GENERIC: lambda channel, data: setpoints.handle_generic(
+                channel, data, flight.tick, allowed=supervisor.can_fly
+            ),
+            wire.SETPOINT: lambda channel, data: setpoints.handle_rpyt(
+                channel, data, flight.tick, allowed=supervisor.can_fly
+            ),
+            wire.SETPOINT_HIGH_LEVEL: self.high_level.handle,
+            wire.LOCALISATION: self.localisation.handle,
+            wire.SUPERVISOR: lambda channel, data: ports.supervise(supervisor, channel, data),
+            wire.MEMORY: self.memory.handle,
+            wire.PLATFORM: self.platform.handle,
+        }
 
     def _send(self, datagram: bytes, *, droppable: bool = False) -> None:
         self._packets[1] += 1
         self.outbox.append((datagram, droppable))
-
-    def _say(self, text: str) -> None:
-        self._console.append(text)
 
     def _flush_console(self) -> None:
         """Send console text after the replies, and only when there is a client."""
@@ -179,11 +145,8 @@ class Firmware:
 
     def _written(self, name: str) -> None:
         if name == "memTst.resetW":
-            array, index = (
-                self.log.table.by_name["memTst.errCntW"].array,
-                self.log.table.by_name["memTst.errCntW"].index,
-            )
-            array[index] = 0.0
+            item = self.log.table.by_name["memTst.errCntW"]
+            item.array[item.index] = 0.0
         if name == "system.storageReformat":
             self.param.reformat()
         if name in self.flight.param:
@@ -229,3 +192,13 @@ class Firmware:
             for n, (array, index) in enumerate(self._rates):
                 array[index] = self._packets[n]
             self._packets = [0, 0]
+
+
+def boot(scenario: "Scenario", seed: int, storage: Storage | None = None) -> Firmware:
+    """A booted drone with all code compiled, so that its clock can start. Raises ScenarioError."""
+    from firmware_sim.flight import Flight  # here: compiled code loads slowly
+
+    flight = Flight(scenario, seed)
+    firmware = Firmware(flight, platform=scenario.platform, seed=seed, parameters=scenario.parameters, storage=storage)
+    firmware.advance(1)
+    return firmware

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_sim.errors import ScenarioError
+from firmware_sim.errors import ScenarioError, checked_number
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.body import Body, loaded_body, replaced
 from firmware_sim.plant.effects.catalogue import Values, parse_effects
@@ -127,20 +127,6 @@ class Link:
     burst: float = key(1.0, 1.0, 1000.0)  # packets lost in a row, mean
 
 
-_SECTIONS: dict[str, type] = {
-    "vehicle": Vehicle,
-    "noise": Noise,
-    "battery": Battery,
-    "sensors": Sensors,
-    "integration": Integration,
-    "estimator": Estimator,
-    "start": Start,
-    "ground": Ground,
-    "link": Link,
-}
-_TABLES = (*_SECTIONS, "parameters", "effects", "hidden", "payload")
-
-
 @dataclass(frozen=True)
 class Scenario:
     """A whole scenario; by default a cf2 with 2.1+ propellers of nominal mass."""
@@ -159,6 +145,24 @@ class Scenario:
     effects: dict[str, Values] = field(default_factory=dict)
     hidden: dict[str, Values] = field(default_factory=dict)
     payload: tuple[PayloadEvent, ...] = ()
+
+    def section(self, name: str, table: dict[str, Any], prefix: str) -> Any:
+        """A section with the checked values of a table; `prefix` goes before a key's name in messages."""
+        section = getattr(self, name)
+        known = {f.name: f for f in fields(section)}
+        values: dict[str, Any] = {}
+        for entry, value in table.items():
+            where = f"{prefix}{entry}"
+            if entry not in known:
+                raise ScenarioError(f"{where} is not a key of a scenario (known: {', '.join(known)})")
+            rule = known[entry].metadata
+            if "choices" not in rule:
+                values[entry] = _numbers(value, where, rule["low"], rule["high"], rule["sizes"])
+            elif value in rule["choices"]:
+                values[entry] = value
+            else:
+                raise ScenarioError(f"{where} must be one of {', '.join(rule['choices'])}, not {value!r}")
+        return replace(section, **values)
 
     def body(self, events: int = 0) -> Body:
         """The body after the first `events` payload events: the vehicle's with its effects and payloads."""
@@ -295,6 +299,7 @@ def parse_scenario(table: dict[str, Any], source: str, folder: Path | None = Non
     folder: base of a relative vehicle_file (default: the working directory).
     """
     platform = table.get("platform", "cf2")
+    known = [f.name for f in fields(Scenario) if f.name != "platform"]
     if not isinstance(platform, str) or platform not in PLATFORMS:
         raise ScenarioError(f"{source}: platform must be one of {', '.join(PLATFORMS)}, not {platform!r}")
     scenario = Scenario(platform=platform)
@@ -303,8 +308,8 @@ def parse_scenario(table: dict[str, Any], source: str, folder: Path | None = Non
     for name, value in table.items():
         if name in ("platform", "vehicle_file"):
             continue
-        if name not in _TABLES:
-            raise ScenarioError(f"{source}: {name} is not part of a scenario (known: {', '.join(_TABLES)})")
+        if name not in known:
+            raise ScenarioError(f"{source}: {name} is not part of a scenario (known: {', '.join(known)})")
         if not isinstance(value, dict):
             raise ScenarioError(f"{source}: {name} must be a section [{name}]")
         if name == "parameters":
@@ -315,9 +320,7 @@ def parse_scenario(table: dict[str, Any], source: str, folder: Path | None = Non
         elif name == "payload":
             continue  # below: it depends on the effects, wherever they stand
         else:
-            scenario = replace(
-                scenario, **{name: replace(getattr(scenario, name), **_section(name, value, f"{source}: {name}."))}
-            )
+            scenario = replace(scenario, **{name: scenario.section(name, value, f"{source}: {name}.")})
     _check_body(scenario, source)
     if "payload" in table:
         events = parse_events(table["payload"], source, loaded=bool(scenario._load()))
@@ -333,29 +336,11 @@ def _of_vehicle_file(scenario: Scenario, value: Any, source: str, folder: Path) 
     vehicle, effects = vehicle_tables(path)
     scenario = replace(
         scenario,
-        vehicle=Vehicle(**_section("vehicle", vehicle, f"{path}: ")),
+        vehicle=scenario.section("vehicle", vehicle, f"{path}: "),
         effects=parse_effects(effects, str(path), "effects"),
     )
     _check_body(scenario, str(path))
     return scenario
-
-
-def _section(name: str, table: dict[str, Any], prefix: str) -> dict[str, Any]:
-    """The checked values that a table gives to a section; `prefix` goes before a key's name in messages."""
-    known = {f.name: f for f in fields(_SECTIONS[name])}
-    values: dict[str, Any] = {}
-    for entry, value in table.items():
-        where = f"{prefix}{entry}"
-        if entry not in known:
-            raise ScenarioError(f"{where} is not a key of a scenario (known: {', '.join(known)})")
-        rule = known[entry].metadata
-        if "choices" in rule:
-            if value not in rule["choices"]:
-                raise ScenarioError(f"{where} must be one of {', '.join(rule['choices'])}, not {value!r}")
-            values[entry] = value
-        else:
-            values[entry] = _numbers(value, where, rule["low"], rule["high"], rule["sizes"])
-    return values
 
 
 def _numbers(value: Any, where: str, low: float, high: float, sizes: tuple[int, ...]) -> float | tuple[float, ...]:
@@ -363,18 +348,10 @@ def _numbers(value: Any, where: str, low: float, high: float, sizes: tuple[int, 
         if len(value) not in sizes or len(value) == 0:
             wanted = " or ".join("one number" if n == 0 else f"{n} numbers" for n in sizes)
             raise ScenarioError(f"{where} must be {wanted}, not a list of {len(value)}")
-        return tuple(_number(v, where, low, high) for v in value)
+        return tuple(checked_number(v, where, low, high) for v in value)
     if 0 not in sizes:
         raise ScenarioError(f"{where} must be a list of {' or '.join(map(str, sizes))} numbers")
-    return _number(value, where, low, high)
-
-
-def _number(value: Any, where: str, low: float, high: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ScenarioError(f"{where} must be a number, not {value!r}")
-    if not low <= value <= high:
-        raise ScenarioError(f"{where} must lie between {low:g} and {high:g}, not {value!r}")
-    return float(value)
+    return checked_number(value, where, low, high)
 
 
 def _parameters(table: dict[str, Any], source: str) -> dict[str, float]:
@@ -382,7 +359,7 @@ def _parameters(table: dict[str, Any], source: str) -> dict[str, float]:
     flat: dict[str, Any] = {}
     for name, value in table.items():
         flat.update({f"{name}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {name: value})
-    return {name: _number(v, f'{source}: parameters."{name}"', -1e9, 1e9) for name, v in flat.items()}
+    return {name: checked_number(v, f'{source}: parameters."{name}"', -1e9, 1e9) for name, v in flat.items()}
 
 
 def _check_body(scenario: Scenario, source: str) -> None:

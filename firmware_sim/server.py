@@ -9,12 +9,15 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from firmware_sim import wire
 from firmware_sim.errors import ServerError
 from firmware_sim.firmware import Firmware
 from firmware_sim.wire import Air
+
+if TYPE_CHECKING:
+    from firmware_sim.flight import Flight
 
 _BUFFER = 1 << 20  # bytes, both ways: a client reads its whole table of contents in bursts
 # Largest delay of the drone's time behind the host's that is caught up after a stall; a longer delay is skipped. Below
@@ -42,20 +45,30 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 class TruthWriter:
-    """Writes rows of the flight's truth (t, position, ...) as CSV, 100 rows a second of firmware time."""
+    """Writes rows of the flight's truth (t, position, ...) as CSV, 100 rows a second of firmware time.
 
-    def __init__(self, file: TextIO, firmware: Firmware):
-        self._file, self._flight = file, firmware.flight
-        self.next_row = self._flight.tick + 1  # tick of the next row
-        self._file.write(",".join(self._flight.truth_header) + "\n")
+    pass_time: lets milliseconds pass. Without a file, time passes and nothing is written.
+    """
 
-    def update(self) -> None:
-        """Write a row if one is due."""
-        if self._flight.tick >= self.next_row:
-            self.next_row = self._flight.tick - self._flight.tick % _TRUTH_PERIOD + _TRUTH_PERIOD
-            row = self._flight.truth_row()
+    def __init__(self, file: TextIO | None, flight: "Flight", pass_time: Callable[[int], None]):
+        self._file, self._flight, self._pass_time = file, flight, pass_time
+        self._next_row = flight.tick + 1  # tick of the next row
+        if file is not None:
+            file.write(",".join(flight.truth_header) + "\n")
+
+    def advance(self, milliseconds: int) -> None:
+        """Let time pass and write the rows that become due."""
+        if self._file is None:
+            self._pass_time(milliseconds)
+            return
+        flight, end = self._flight, self._flight.tick + milliseconds
+        while flight.tick < end:
+            self._pass_time(min(end, self._next_row) - flight.tick)
+            if flight.tick < self._next_row:
+                continue
+            self._next_row = flight.tick - flight.tick % _TRUTH_PERIOD + _TRUTH_PERIOD
             try:
-                self._file.write(",".join(f"{value:.9g}" for value in row) + "\n")
+                self._file.write(",".join(f"{value:.9g}" for value in flight.truth_row()) + "\n")
             except OSError as error:
                 raise ServerError(f"cannot write the truth file: {error.strerror}") from None
 
@@ -77,9 +90,8 @@ class Server:
         self.client: Address | None = None
         self.dropped = 0  # log packets
         self._pending: deque[bytes] = deque()  # replies the socket had no room for
-        self._truth = TruthWriter(truth, firmware) if truth else None
+        self._truth = TruthWriter(truth, firmware.flight, firmware.advance)
         self.stopping = False
-        self.stood_still = 0  # how often the host was so late that the drone's time stood still instead
         self._zero, self._epoch = 0, 0.0
 
     def run(self) -> None:
@@ -112,9 +124,8 @@ class Server:
         if behind > most:
             self.begin()
             behind = 0
-            self.stood_still += 1
         if behind > 0:
-            self._advance(min(behind, _CHUNK_MS))
+            self._truth.advance(min(behind, _CHUNK_MS))
         self._receive_all()
         self._transmit()
         if behind > _CHUNK_MS:
@@ -125,15 +136,6 @@ class Server:
     def wanted(self) -> int:
         """Events of the socket to wait for (`selectors`)."""
         return selectors.EVENT_READ | (selectors.EVENT_WRITE if self._pending else 0)
-
-    def _advance(self, milliseconds: int) -> None:
-        if self._truth is None:
-            self.firmware.advance(milliseconds)
-            return
-        end = self.firmware.flight.tick + milliseconds
-        while self.firmware.flight.tick < end:
-            self.firmware.advance(min(end, self._truth.next_row) - self.firmware.flight.tick)
-            self._truth.update()
 
     def _receive_all(self) -> None:
         """Handle the datagrams that have arrived, at most a burst at a time: the flight must go on."""

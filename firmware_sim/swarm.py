@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from firmware_sim.errors import ScenarioError
-from firmware_sim.firmware import Firmware
+from firmware_sim.firmware import Firmware, boot
 from firmware_sim.server import Server, bind
 from firmware_sim.vehicle_file import read_toml
 from firmware_sim.wire import Air
@@ -200,16 +200,11 @@ def _next(firmware: Firmware) -> int:
 def open_swarm(drones: Sequence[Drone], stack: contextlib.ExitStack, *, host: str, speed: float) -> Swarm:
     """Bind the sockets and boot the drones; `stack` closes the sockets. Raises ServerError, ScenarioError."""
     sockets = [stack.enter_context(contextlib.closing(bind(host, drone.port))) for drone in drones]
-    from firmware_sim.flight import Flight  # late: compiled code loads slowly, a port in use is told first
-
     servers = []
     for drone, sock in zip(drones, sockets, strict=True):
         scenario = drone.load()
-        flight = Flight(scenario, drone.seed)
-        firmware = Firmware(flight, platform=scenario.platform, seed=drone.seed, parameters=scenario.parameters)
-        firmware.advance(1)  # compiles what is not compiled yet, before the clock starts
         air = Air(scenario.link.loss, scenario.link.burst, drone.seed)
-        servers.append(Server(firmware, sock, speed=speed, air=air))
+        servers.append(Server(boot(scenario, drone.seed), sock, speed=speed, air=air))
         address, port = sock.getsockname()
         print(
             f"firmware_sim: udp://{address}:{port} platform {scenario.platform} seed {drone.seed} name {drone.name}",

@@ -79,14 +79,23 @@ def integrates(truth, tick):
 @kernel
 def plant_step(truth, state, noise, dt):
     """Move rotors, battery and body on by dt under the present PWM."""
-    mean, u, force, torque = np.empty(4), np.empty(4), np.empty(3), np.empty(3)
+    mean, u, force, torque = np.empty(4), np.empty(4), np.zeros(3), np.zeros(3)
     lag(truth, state, dt, mean)
     wrench(truth, mean, 0, u)
-    for i in range(3):
-        force[i] = 0.0
-        torque[i] = 0.0
     body_step(truth, state, u, force, torque, noise, dt)
     battery_step(truth, state, dt)
+
+
+@kernel
+def log_rest(truth, board, state, sensor, setpoint, param, memory, log, union_float, union_short, noise, tick):
+    """Write all log variables but those of the estimate."""
+    log_inertial(sensor, log)
+    log_battery(sensor, log)
+    log_baro(state, noise, tick, log)
+    log_setpoint(setpoint, log)
+    log_control(memory, param, log, union_float, union_short)
+    if board[at.B_BRUSHLESS] > 0.0:
+        log_rotor_speed(truth, board, state, noise, log)
 
 
 @kernel
@@ -101,13 +110,7 @@ def tick_step(
     if integrates(truth, tick):
         plant_step(truth, state, noise, DT * truth[at.INTEGRATION_STEP])
     log_estimate(sensor, estimate, P, log)
-    log_inertial(sensor, log)
-    log_battery(sensor, log)
-    log_baro(state, noise, tick, log)
-    log_setpoint(setpoint, log)
-    log_control(memory, param, log, union_float, union_short)
-    if board[at.B_BRUSHLESS] > 0.0:
-        log_rotor_speed(truth, board, state, noise, log)
+    log_rest(truth, board, state, sensor, setpoint, param, memory, log, union_float, union_short, noise, tick)
 
 
 @kernel
@@ -128,10 +131,4 @@ def tick_step_with_effects(
     delay_estimate(truth, sensor, estimate, tick)
     log_estimate(sensor, estimate, P, log)
     restore_estimate(sensor, estimate)
-    log_inertial(sensor, log)
-    log_battery(sensor, log)
-    log_baro(state, noise, tick, log)
-    log_setpoint(setpoint, log)
-    log_control(memory, param, log, union_float, union_short)
-    if board[at.B_BRUSHLESS] > 0.0:
-        log_rotor_speed(truth, board, state, noise, log)
+    log_rest(truth, board, state, sensor, setpoint, param, memory, log, union_float, union_short, noise, tick)

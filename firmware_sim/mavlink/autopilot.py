@@ -39,17 +39,16 @@ class Autopilot:
     Args:
         firmware: the drone; the autopilot is its only client.
         thrust: N, largest total thrust of the four rotors by the firmware's constants.
-        system: the MAVLink system id.
 
     Attributes:
         outbox: frames to be sent.
     """
 
-    def __init__(self, firmware: Firmware, *, thrust: float, system: int = 1) -> None:
+    def __init__(self, firmware: Firmware, *, thrust: float) -> None:
         self.firmware = firmware
         self.outbox: deque[bytes] = deque(maxlen=_MOST_WAITING)
         self.mode = MANUAL
-        self._packer = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
+        self._packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         self._parsers: dict[int, Any] = {}
         self._mass = firmware.flight.param["ctrlLee.mass"]
         controller, index = firmware.flight.param["stabilizer.controller"]
@@ -217,15 +216,11 @@ class Autopilot:
         if m.coordinate_frame != 1:  # MAV_FRAME_LOCAL_NED
             return None
         no_position, no_velocity, no_acceleration = (bool(m.type_mask & mask) for mask in _TARGET_MASKS)
-        out = sp.null_setpoint()
-        modes = [sp.MODE_X, sp.MODE_Y, sp.MODE_Z]
-        if not no_position:
-            out[modes] = sp.ABSOLUTE
-            out[sp.X : sp.Z + 1] = turned((m.x, m.y, m.z))
-        elif not no_velocity:
+        if no_position:
             return None  # the Lee controller flies to places
-        else:
-            return None
+        out = sp.null_setpoint()
+        out[[sp.MODE_X, sp.MODE_Y, sp.MODE_Z]] = sp.ABSOLUTE
+        out[sp.X : sp.Z + 1] = turned((m.x, m.y, m.z))
         if not no_velocity:
             out[sp.VX : sp.VZ + 1] = turned((m.vx, m.vy, m.vz))
         if not no_acceleration:

@@ -4,7 +4,6 @@ import argparse
 import contextlib
 import os
 import select
-import signal
 import socket
 import time
 import tty
@@ -12,8 +11,10 @@ from collections.abc import Sequence
 from typing import Protocol, TextIO
 
 from firmware_sim.errors import FirmwareSimError, ServerError
+from firmware_sim.firmware import boot
 from firmware_sim.mavlink.autopilot import Autopilot
 from firmware_sim.server import TruthWriter
+from firmware_sim.start import open_truth, stop_on_signals
 
 _MAX_BEHIND, _CHUNK = 250.0, 20  # ms of host time to catch up; ms of drone time between two looks at the wire
 _BURST, _ERRORS = 64, 16  # datagrams handled at a time; errors of a client that is not there
@@ -133,7 +134,7 @@ class MavlinkServer:
         self, autopilot: Autopilot, wires: Sequence[Wire], *, speed: float = 1.0, truth: TextIO | None = None
     ) -> None:
         self.autopilot, self._wires, self._speed = autopilot, wires, speed
-        self._truth = TruthWriter(truth, autopilot.firmware) if truth else None
+        self._truth = TruthWriter(truth, autopilot.firmware.flight, autopilot.advance)
         self.dropped = 0
         self.stopping = False
 
@@ -146,7 +147,7 @@ class MavlinkServer:
             if behind > _MAX_BEHIND * self._speed + _CHUNK:
                 zero, epoch, behind = flight.tick, time.monotonic(), 0
             if behind > 0:
-                self._advance(min(behind, _CHUNK))
+                self._truth.advance(min(behind, _CHUNK))
             self._listen()
             self._talk()
             if behind > _CHUNK:
@@ -167,48 +168,22 @@ class MavlinkServer:
             frame = self.autopilot.outbox.popleft()
             self.dropped += sum(not wire.send(frame) for wire in self._wires)
 
-    def _advance(self, milliseconds: int) -> None:
-        flight = self.autopilot.firmware.flight
-        end = flight.tick + milliseconds
-        while flight.tick < end:
-            step = end if self._truth is None else min(end, self._truth.next_row)
-            self.autopilot.advance(step - flight.tick)
-            if self._truth is not None:
-                self._truth.update()
-
 
 def run(arguments: argparse.Namespace) -> None:
     """Serve until SIGINT or SIGTERM. Raises FirmwareSimError in one sentence."""
-    if arguments.seed < 0:
-        raise FirmwareSimError(f"--seed must not be negative, it is {arguments.seed}")
     if arguments.swarm is not None:
         raise FirmwareSimError("--mavlink is for one drone: leave out --swarm")
     with contextlib.ExitStack() as stack:
         wires = [stack.enter_context(contextlib.closing(wire_of(text))) for text in arguments.mavlink]
-        from firmware_sim.firmware import Firmware  # here: compiled code takes a while to load
-        from firmware_sim.flight import Flight
-        from firmware_sim.mavlink.autopilot import Autopilot
         from firmware_sim.plant import layout
-        from firmware_sim.scenario import load_scenario
+        from firmware_sim.scenario import load_scenario  # here: compiled code takes a while to load
 
         scenario = load_scenario(arguments.scenario)
-        truth = None
-        if arguments.truth:
-            try:
-                truth = stack.enter_context(arguments.truth.open("w", encoding="utf-8"))
-            except OSError as error:
-                raise ServerError(f"cannot write {arguments.truth}: {error.strerror}") from None
-        flight = Flight(scenario, arguments.seed)
-        firmware = Firmware(flight, platform=scenario.platform, seed=arguments.seed, parameters=scenario.parameters)
-        firmware.advance(1)
+        truth = open_truth(arguments.truth, stack)
+        firmware = boot(scenario, arguments.seed)
         autopilot = Autopilot(firmware, thrust=4.0 * float(scenario.board()[layout.B_THRUST_MAX]))
         server = MavlinkServer(autopilot, wires, speed=arguments.speed, truth=truth)
-
-        def stop(_signal: int, _frame: object) -> None:
-            server.stopping = True
-
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, stop)
+        stop_on_signals(server)
         where = " ".join(wire.where for wire in wires)
         print(f"firmware_sim: {where} platform {scenario.platform} seed {arguments.seed}", flush=True)
         server.run()

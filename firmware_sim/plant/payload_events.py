@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_sim.errors import ScenarioError
+from firmware_sim.errors import ScenarioError, checked_number
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.quaternion import matrix
 
@@ -146,18 +146,10 @@ def _event(table: Any, where: str) -> PayloadEvent:
 def _number(table: Mapping[str, Any], name: str, where: str, low: float, high: float) -> float:
     if name not in table:
         raise ScenarioError(f"{where}.{name} is missing")
-    return _checked(table[name], f"{where}.{name}", low, high)
+    return checked_number(table[name], f"{where}.{name}", low, high)
 
 
 def _vector(value: Any, where: str, limit: float) -> tuple[float, ...]:
     if not isinstance(value, list) or len(value) != 3:
         raise ScenarioError(f"{where} must be a list of 3 numbers")
-    return tuple(_checked(v, where, -limit, limit) for v in value)
-
-
-def _checked(value: Any, where: str, low: float, high: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ScenarioError(f"{where} must be a number, not {value!r}")
-    if not low <= value <= high:
-        raise ScenarioError(f"{where} must lie between {low:g} and {high:g}, not {value!r}")
-    return float(value)
+    return tuple(checked_number(v, where, -limit, limit) for v in value)

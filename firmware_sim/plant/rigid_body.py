@@ -68,24 +68,12 @@ RATE_LIMIT = 200.0  # rad/s
 
 
 @kernel
-def derivative(truth, x, u, force, torque, dx, R, f, t):
-    """dx/dt of x = [p, v, q, w] (13) under u = [F, Mx, My, Mz] and an external force (world) and torque (body).
+def newton_euler(truth, x, w, f, t, dx):
+    """dx/dt of x = [p, v, q, w] under force f [N, world] and torque t [N m, body] about the centre of mass, and weight.
 
-    R (3x3), f (3) and t (3) are scratch. Returns the number of feet on the floor.
+    w is x[10:13]; t gains the gyroscopic torque.
     """
-    matrix(x, 6, R)
-    w = x[10:13]
-    for i in range(3):
-        f[i] = force[i] + R[i, 2] * u[0]
-        t[i] = torque[i] + u[1 + i]
-    touching = contact(truth, x[0:3], x[3:6], R, w, f, t)
-    J = at.INERTIA
-    hx = truth[J] * w[0] + truth[J + 1] * w[1] + truth[J + 2] * w[2]
-    hy = truth[J + 3] * w[0] + truth[J + 4] * w[1] + truth[J + 5] * w[2]
-    hz = truth[J + 6] * w[0] + truth[J + 7] * w[1] + truth[J + 8] * w[2]
-    t[0] -= w[1] * hz - w[2] * hy
-    t[1] -= w[2] * hx - w[0] * hz
-    t[2] -= w[0] * hy - w[1] * hx
+    gyroscopic(truth, w, t)
     V = at.INERTIA_INV
     for i in range(3):
         dx[i] = x[3 + i]
@@ -97,6 +85,33 @@ def derivative(truth, x, u, force, torque, dx, R, f, t):
     dx[7] = 0.5 * (qw * w[0] + qy * w[2] - qz * w[1])
     dx[8] = 0.5 * (qw * w[1] + qz * w[0] - qx * w[2])
     dx[9] = 0.5 * (qw * w[2] + qx * w[1] - qy * w[0])
+
+
+@kernel
+def gyroscopic(truth, w, t):
+    """t <- t - w x J w."""
+    J = at.INERTIA
+    hx = truth[J] * w[0] + truth[J + 1] * w[1] + truth[J + 2] * w[2]
+    hy = truth[J + 3] * w[0] + truth[J + 4] * w[1] + truth[J + 5] * w[2]
+    hz = truth[J + 6] * w[0] + truth[J + 7] * w[1] + truth[J + 8] * w[2]
+    t[0] -= w[1] * hz - w[2] * hy
+    t[1] -= w[2] * hx - w[0] * hz
+    t[2] -= w[0] * hy - w[1] * hx
+
+
+@kernel
+def derivative(truth, x, u, force, torque, dx, R, f, t):
+    """dx/dt of x = [p, v, q, w] (13) under u = [F, Mx, My, Mz] and an external force (world) and torque (body).
+
+    R (3x3), f (3) and t (3) are scratch. Returns the number of feet on the floor.
+    """
+    matrix(x, 6, R)
+    w = x[10:13]
+    for i in range(3):
+        f[i] = force[i] + R[i, 2] * u[0]
+        t[i] = torque[i] + u[1 + i]
+    touching = contact(truth, x[0:3], x[3:6], R, w, f, t)
+    newton_euler(truth, x, w, f, t, dx)
     return touching
 
 

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import signal
 import sys
 import time
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ from firmware_sim.relay.faults import DOWN, FATES, UP, Engine, Fault
 from firmware_sim.relay.kinds import KIND_NAMES, RelayError
 from firmware_sim.relay.relay import Relay, parse_target
 from firmware_sim.relay.schedule import load_schedule
+from firmware_sim.start import stop_on_signals
 
 _EPILOG = f"""\
 kinds: {", ".join(sorted(set(KIND_NAMES.values())))}; "log" is all of log.*
@@ -139,12 +139,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except FirmwareSimError as error:
         print(f"relay: {error}", file=sys.stderr)
         return 2
-
-    def stop(_signal: int, _frame: object) -> None:
-        relay.stopping = True
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stop)
+    stop_on_signals(relay)
     print(f"relay: {relay.uri} -> udp://{relay.target[0]}:{relay.target[1]} seed {seed}", flush=True)
     end = float("inf") if arguments.duration is None else time.monotonic() + arguments.duration
     try:

@@ -144,10 +144,6 @@ class Engine:
         """Every fault and the number of packets it has harmed."""
         return [(rule.fault, rule.harmed) for rule in self._rules]
 
-    def elapsed(self, now: float) -> float:
-        """s since the first packet, 0 before it."""
-        return 0.0 if self.began is None else now - self.began
-
     def dead(self, now: float) -> bool:
         """Whether a fault wants the port closed now; never before the first packet, from which faults count."""
         if self.began is None:

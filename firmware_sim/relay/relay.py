@@ -43,20 +43,15 @@ class Relay:
         self._selector = selectors.DefaultSelector()
         self._drones: dict[Address, socket.socket] = {}  # host -> the socket that speaks to the drone for it
         self._heard: dict[Address, float] = {}
-        self._address: Address = (host, port)
+        self.address: Address = (host, port)  # where hosts connect to
         self._listener: socket.socket | None = None
         self._place: socket.socket | None = None  # keeps the port while it refuses
         self._open()
 
     @property
-    def address(self) -> Address:
-        """Where hosts connect to."""
-        return self._address
-
-    @property
     def uri(self) -> str:
         """The same as a URI."""
-        return f"udp://{self._address[0]}:{self._address[1]}"
+        return f"udp://{self.address[0]}:{self.address[1]}"
 
     def run(self, until: Callable[[], bool] | None = None) -> None:
         """Relay until `stopping` is set or `until()` is true; closes everything."""
@@ -88,13 +83,13 @@ class Relay:
         self._give_place()
         sock = _socket()
         try:
-            sock.bind(self._address)
+            sock.bind(self.address)
         except (OSError, OverflowError) as error:
             sock.close()
-            host, port = self._address
+            host, port = self.address
             reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
             raise RelayError(f"cannot listen on udp://{host}:{port}: {reason}") from None
-        self._address = sock.getsockname()
+        self.address = sock.getsockname()
         self._listener = sock
         self._selector.register(sock, selectors.EVENT_READ, None)
 
@@ -111,8 +106,8 @@ class Relay:
         """
         self._close_listener()
         self._place = _socket()
-        self._place.bind(self._address)
-        self._place.connect(self._address)
+        self._place.bind(self.address)
+        self._place.connect(self.address)
 
     def _give_place(self) -> None:
         if self._place is not None:

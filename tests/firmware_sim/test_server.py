@@ -8,38 +8,21 @@ import itertools
 import signal
 import socket
 import struct
-import subprocess
-import sys
 import time
 import types
 from unittest import mock
 
 import pytest
+from processes import TIMEOUT, running
 
 from firmware_sim.__main__ import main
 from firmware_sim.server import Server
 
-TIMEOUT = 60.0  # s; only for a machine that hangs
-
-
-@contextlib.contextmanager
-def simulator(*arguments):
-    """A running simulator: its process and port."""
-    command = [sys.executable, "-m", "firmware_sim", "--port", "0", *arguments]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            line = process.stdout.readline()
-            assert line.startswith("firmware_sim: udp://127.0.0.1:"), line + process.stderr.read()
-            yield process, int(line.split()[1].rpartition(":")[2])
-        finally:
-            process.terminate()
-            process.communicate(timeout=TIMEOUT)
-
 
 @pytest.fixture(scope="module")
 def port():
-    with simulator() as (_, number):
-        yield number
+    with running("firmware_sim", "--port", "0") as (_, uri):
+        yield int(uri.rpartition(":")[2])
 
 
 @pytest.fixture
@@ -125,16 +108,6 @@ def test_a_burst_is_answered_exactly_once_and_in_order(connect):
     ask(client, b"\x5d\x05")
 
 
-def test_log_packets_keep_coming_at_the_firmware_rate(connect):
-    client = connect()
-    start_log(client)
-    stamps = [int.from_bytes(datagram[2:5], "little") for datagram in receive(client, 0x5E, 100)]
-    ask(client, b"\x5d\x05")
-    gaps = [b - a for a, b in itertools.pairwise(stamps)]
-    assert abs(sum(gaps) - 990) <= 16
-    assert sorted(gaps)[len(gaps) // 2] == 10
-
-
 class BusySocket:
     """A socket with room for a number of datagrams."""
 
@@ -149,7 +122,8 @@ class BusySocket:
 
 
 def test_when_the_socket_is_full_log_packets_are_dropped_and_replies_wait():
-    sock, firmware = BusySocket(), types.SimpleNamespace(outbox=collections.deque())
+    sock, flight = BusySocket(), types.SimpleNamespace(tick=0)
+    firmware = types.SimpleNamespace(outbox=collections.deque(), flight=flight, advance=None)
     server = Server(firmware, sock)
     server.client = ("127.0.0.1", 1)
     firmware.outbox.extend([(b"reply 1", False), (b"log", True), (b"reply 2", False)])
@@ -186,6 +160,11 @@ def assert_one_sentence(result, *words):
 
 
 def test_mistakes_get_one_sentence(port, tmp_path):
+    scenario = tmp_path / "scenario.toml"
+    scenario.write_text('[parameters]\n"ctrlLee.mas" = 0.03\n')
+    assert_one_sentence(run("--port", "0", "--scenario", str(scenario)), "ctrlLee.mas")
+    assert_one_sentence(run("--port", "0", "--scenario", str(tmp_path / "none.toml")), "none.toml")
+    assert_one_sentence(run("--port", "0", "--truth", str(tmp_path / "no" / "truth.csv")), "truth.csv")
     assert_one_sentence(run("--port", str(port)), f"127.0.0.1:{port}", "in use")
     assert_one_sentence(run("--host", "203.0.113.7", "--port", "0"), "203.0.113.7")
     assert_one_sentence(run("--port", "70000"), "70000")
@@ -193,18 +172,10 @@ def test_mistakes_get_one_sentence(port, tmp_path):
     assert_one_sentence(run("--port", "0", "--seed", "-1"), "seed")
 
 
-def test_a_parameter_the_firmware_does_not_have_is_named(tmp_path):
-    scenario = tmp_path / "scenario.toml"
-    scenario.write_text('[parameters]\n"ctrlLee.mas" = 0.03\n')
-    assert_one_sentence(run("--port", "0", "--scenario", str(scenario)), "ctrlLee.mas")
-    assert_one_sentence(run("--port", "0", "--scenario", str(tmp_path / "none.toml")), "none.toml")
-    assert_one_sentence(run("--port", "0", "--truth", str(tmp_path / "no" / "truth.csv")), "truth.csv")
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_cleanly_with_the_truth_written(number, tmp_path):
     path = tmp_path / "truth.csv"
-    with simulator("--speed", "5", "--truth", str(path)) as (process, _):
+    with running("firmware_sim", "--port", "0", "--speed", "5", "--truth", str(path)) as (process, _):
         time.sleep(0.5)
         process.send_signal(number)
         assert process.wait(TIMEOUT) == 0

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from firmware_sim.errors import ScenarioError
+from firmware_sim.errors import ScenarioError, checked_number
 
 Values = dict[str, Any]  # parameter -> number, None (the vehicle's own value) or tuple of stream names
 LONGEST_DELAY = 0.1  # s
@@ -162,13 +162,10 @@ def _values(effect: Effect, table: Mapping[str, Any], where: str) -> Values:
 
 
 def _number(value: Any, p: Parameter, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ScenarioError(f"{where} must be a number, not {value!r}")
-    if not p.low <= value <= p.high:
-        raise ScenarioError(f"{where} must lie between {p.low:g} and {p.high:g} {p.unit}".rstrip() + f", not {value!r}")
-    if p.whole and value != int(value):
+    number = checked_number(value, where, p.low, p.high, p.unit)
+    if p.whole and not number.is_integer():
         raise ScenarioError(f"{where} must be a whole number, not {value!r}")
-    return float(value)
+    return number
 
 
 def _streams(value: Any, where: str) -> tuple[str, ...]:

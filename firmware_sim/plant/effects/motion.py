@@ -11,7 +11,7 @@ from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.air import add_cable_force, air_forces
 from firmware_sim.plant.quaternion import matrix
-from firmware_sim.plant.rigid_body import GRAVITY, contact
+from firmware_sim.plant.rigid_body import contact
 
 
 @kernel
@@ -80,35 +80,3 @@ def static_forces(truth, state, ambient, force, torque, out_force, out_torque):
         out_force[i], out_torque[i] = force[i], torque[i]
     air_forces(truth, R, v, state[at.OMEGA : at.OMEGA + 3], ambient, out_force, out_torque)
     add_cable_force(truth, p, out_force)
-
-
-@kernel
-def newton_euler(truth, x, w, f, t, dx):
-    """dx/dt of x = [p, v, q, w] under force f [N, world] and torque t [N m, body] about the centre of mass, and weight.
-
-    w is x[10:13]; t gains the gyroscopic torque.
-    """
-    gyroscopic(truth, w, t)
-    V = at.INERTIA_INV
-    for i in range(3):
-        dx[i] = x[3 + i]
-        dx[3 + i] = f[i] / truth[at.MASS]
-        dx[10 + i] = truth[V + 3 * i] * t[0] + truth[V + 3 * i + 1] * t[1] + truth[V + 3 * i + 2] * t[2]
-    dx[5] -= GRAVITY
-    qw, qx, qy, qz = x[6], x[7], x[8], x[9]
-    dx[6] = 0.5 * (-qx * w[0] - qy * w[1] - qz * w[2])
-    dx[7] = 0.5 * (qw * w[0] + qy * w[2] - qz * w[1])
-    dx[8] = 0.5 * (qw * w[1] + qz * w[0] - qx * w[2])
-    dx[9] = 0.5 * (qw * w[2] + qx * w[1] - qy * w[0])
-
-
-@kernel
-def gyroscopic(truth, w, t):
-    """t <- t - w x J w."""
-    J = at.INERTIA
-    hx = truth[J] * w[0] + truth[J + 1] * w[1] + truth[J + 2] * w[2]
-    hy = truth[J + 3] * w[0] + truth[J + 4] * w[1] + truth[J + 5] * w[2]
-    hz = truth[J + 6] * w[0] + truth[J + 7] * w[1] + truth[J + 8] * w[2]
-    t[0] -= w[1] * hz - w[2] * hy
-    t[1] -= w[2] * hx - w[0] * hz
-    t[2] -= w[0] * hy - w[1] * hx

@@ -11,10 +11,10 @@ from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.air import gusts_step, vibration_step
 from firmware_sim.plant.effects.drive import count_airborne_time, rotors_step, store_commands
-from firmware_sim.plant.effects.motion import act, ambient_forces, newton_euler, origin, static_forces
+from firmware_sim.plant.effects.motion import act, ambient_forces, origin, static_forces
 from firmware_sim.plant.effects.suspended_load import add_string_force, normalise_string, rest_load, share_impulse
 from firmware_sim.plant.quaternion import matrix, normalise
-from firmware_sim.plant.rigid_body import GRAVITY, RATE_LIMIT, SPEED_LIMIT, body_step, is_resting
+from firmware_sim.plant.rigid_body import GRAVITY, RATE_LIMIT, SPEED_LIMIT, body_step, is_resting, newton_euler
 from firmware_sim.plant.rotors import battery_step, lag, wrench
 
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.effects.motion import gyroscopic
-from firmware_sim.plant.rigid_body import GRAVITY
+from firmware_sim.plant.rigid_body import GRAVITY, gyroscopic
 
 SWING_LIMIT = 200.0  # 1/s; keeps extreme scenarios finite
 
