@@ -1,8 +1,9 @@
-"""The fault relay in a thread, between a test's link and its drone."""
+"""A connected link, and the fault relay in a thread, between a test's link and its drone."""
 
 import contextlib
 import threading
 
+from crazyem.links.crazyflie import CrazyflieLink
 from firmware_sim.relay.faults import Engine, Fault
 from firmware_sim.relay.relay import Relay, parse_target
 
@@ -19,6 +20,17 @@ def relayed(uri, *faults, seed=0):
         relay.stopping = True
         thread.join(60)
         assert not thread.is_alive()
+
+
+@contextlib.contextmanager
+def connected(uri, timeout=120.0):  # s; for machines that are busy
+    """A link that is connected, and closed at the end."""
+    link = CrazyflieLink(uri)
+    link.connect(timeout)
+    try:
+        yield link
+    finally:
+        link.close()
 
 
 def down(what, **options):

@@ -17,23 +17,11 @@ from firmware_sim.plant.effects.step import plant_step_with_effects
 from firmware_sim.scenario import Scenario, parse_scenario
 
 STILL = np.zeros(at.NOISE_WIDTH)
-
-
 G = np.array([0.0, 0.0, -9.81])
-
-
 ARM, K = 0.03, 0.006
-
-
 MASS, INERTIA = 0.03, [2e-5, 1.5e-5, 3e-5, 1e-6, -5e-7, 8e-7]
-
-
 PWM = np.array([30000.0, 31000.0, 30500.0, 30600.0])
-
-
 THRUST = 0.03 * PWM / 65535 * 4.2  # N, of a linear curve on a battery that never sags
-
-
 PLAIN = {
     "vehicle": {
         "mass": MASS, "inertia": INERTIA, "arm": ARM, "torque_per_thrust": K, "thrust_curve": [0.0, 0.03],
@@ -44,8 +32,6 @@ PLAIN = {
     "ground": {"height": -1000.0},
     "start": {"velocity": [0.4, -0.3, 0.2], "yaw": 0.7},
 }  # fmt: skip
-
-
 OMEGA = np.array([1.5, -2.0, 1.0])  # rad/s, at the start
 
 
@@ -141,6 +127,12 @@ def plant(effects: dict, hidden: dict | None = None, **vehicle: float) -> tuple[
     return truth, x, scenario
 
 
+def advance(truth: np.ndarray, x: np.ndarray, milliseconds: int) -> None:
+    """Let the plant move without noise."""
+    for _ in range(milliseconds):
+        plant_step_with_effects(truth, x, STILL, 1e-3)
+
+
 def seen(truth: np.ndarray, x: np.ndarray) -> np.ndarray:
     """State of the plant in the model's order: origin's position and velocity, quaternion x y z w, rate, pendulum."""
     p, v = np.empty(3), np.empty(3)
@@ -151,8 +143,7 @@ def seen(truth: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def compare(model: Model, truth: np.ndarray, x: np.ndarray, seconds: float = 1.0, tolerance: float = 1e-6) -> None:
     start = seen(truth, x)
-    for _ in range(round(1000 * seconds)):
-        plant_step_with_effects(truth, x, STILL, 1e-3)
+    advance(truth, x, round(1000 * seconds))
     end, expected = seen(truth, x), model.fly(start, seconds)
     if end[6:10] @ expected[6:10] < 0:
         expected[6:10] *= -1

@@ -7,25 +7,13 @@ reply would hang it (crtp.md 7), whoever the drone is.
 import contextlib
 import os
 import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from processes import running
 
 CHECK = Path(__file__).parents[2] / "benchmarks" / "cfclient_check.py"
 FAULTS = ["--drop", "0.05", "--burst", "2", "--duplicate", "0.02", "--reorder", "0.02", "--kinds", "log.data"]
-
-
-@contextlib.contextmanager
-def running(*module: str) -> Iterator[str]:
-    """A simulator or relay as a process: its URI."""
-    with subprocess.Popen([sys.executable, "-m", *module], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        try:
-            yield process.stdout.readline().split()[1]
-        finally:
-            process.terminate()
 
 
 @pytest.mark.slow
@@ -37,9 +25,9 @@ def test_cfclient_reaches_fully_connected_without_an_exception(behind_the_relay:
     if subprocess.run([python, "-c", "import cfclient, PyQt6.QtWidgets"], capture_output=True, check=False).returncode:
         pytest.skip(f"{python} cannot import cfclient")
     with contextlib.ExitStack() as stack:
-        uri = stack.enter_context(running("firmware_sim", "--port", "0"))
+        _, uri = stack.enter_context(running("firmware_sim", "--port", "0"))
         if behind_the_relay:
-            uri = stack.enter_context(running("firmware_sim.relay", uri, *FAULTS))
+            _, uri = stack.enter_context(running("firmware_sim.relay", uri, *FAULTS))
         result = subprocess.run(
             [python, str(CHECK), uri, "--seconds", "3"], capture_output=True, text=True, timeout=180, check=False
         )

@@ -1,7 +1,6 @@
 """Unmodified cflib against the simulator process: scan, connect, log, parameters, memory, flights, a second client."""
 
 import contextlib
-import json
 import os
 import queue
 import subprocess
@@ -10,6 +9,7 @@ import threading
 import time
 
 import pytest
+from processes import TIMEOUT, running
 
 cflib_crtp = pytest.importorskip("cflib.crtp")
 from cflib.crazyflie import Crazyflie  # noqa: E402
@@ -17,22 +17,9 @@ from cflib.crazyflie.log import LogConfig  # noqa: E402
 from cflib.crazyflie.mem import MemoryElement, Poly4D  # noqa: E402
 from cflib.crazyflie.syncCrazyflie import SyncCrazyflie  # noqa: E402
 
-TIMEOUT = 60.0  # s; only for a machine that hangs
 SPEED = 4.0  # firmware seconds per second, in flights
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-
-
-@contextlib.contextmanager
-def simulator(*arguments):
-    """A running simulator: its URI."""
-    command = [sys.executable, "-m", "firmware_sim", "--port", "0", *arguments]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            yield process.stdout.readline().split()[1]
-        finally:
-            process.terminate()
-            process.wait(TIMEOUT)
 
 
 @contextlib.contextmanager
@@ -41,6 +28,13 @@ def connected(uri):
     with SyncCrazyflie(uri, cf=Crazyflie(ro_cache=None, rw_cache=None)) as scf:
         scf.wait_for_params()
         yield scf.cf
+
+
+@contextlib.contextmanager
+def simulator(*arguments):
+    """A running simulator: its URI."""
+    with running("firmware_sim", "--port", "0", *arguments) as (_, uri):
+        yield uri
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -91,15 +85,9 @@ def wait_until(condition):
 
 def test_scan_lists_the_simulator():
     for number in range(19850, 19860):
-        process = subprocess.Popen(
-            [sys.executable, "-m", "firmware_sim", "--port", str(number)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
-        with process:
-            line = process.stdout.readline()
-            if not line:
+        command = [sys.executable, "-m", "firmware_sim", "--port", str(number)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+            if not process.stdout.readline():
                 continue  # somebody else's simulator is there
             found = [address for address, _ in cflib_crtp.scan_interfaces() if address.startswith("udp")]
             process.terminate()
@@ -114,6 +102,9 @@ def test_it_connects_fully_and_a_second_client_can_follow(uri):
             assert cf.platform.get_protocol_version() == 12
             assert "ctrlLee" in cf.param.toc.toc
             assert cf.param.get_value("deck.bcLighthouse4") == "0"
+            assert cf.supervisor.is_auto_armed
+            assert cf.supervisor.is_armed
+            assert not cf.supervisor.is_flying
             samples = collect(cf, {"block": ["pm.vbat"]}, 5)
             assert 3.0 < samples["block"][0][1]["pm.vbat"] < 4.3
         assert not cf.is_connected()
@@ -178,13 +169,6 @@ def test_a_parameter_stored_by_cflib_survives_a_restart(tmp_path):
         assert float(cf.param.get_value("kalman.dragB_x")) == pytest.approx(0.35)
 
 
-def test_supervisor_and_console(uri):
-    with connected(uri) as cf:
-        assert cf.supervisor.is_auto_armed
-        assert cf.supervisor.is_armed
-        assert not cf.supervisor.is_flying
-
-
 def fly(cf):
     """Lee's controller, and the high-level commander in charge."""
     cf.param.set_value("stabilizer.controller", "5")
@@ -232,94 +216,3 @@ def test_full_state_flight_and_what_closing_in_flight_does():
         with connected(uri) as cf:  # closing sent a zero setpoint: the motors are off, and then the supervisor locked
             wait_until(lambda: cf.supervisor.is_locked)
             assert not cf.supervisor.can_fly
-
-
-@pytest.mark.slow
-def test_the_next_client_must_notify_before_the_high_level_flies():
-    with simulator("--speed", str(SPEED)) as uri:
-        with connected(uri):
-            pass
-        with connected(uri) as cf:
-            cf.param.set_value("stabilizer.controller", "5")
-            cf.high_level_commander.takeoff(0.5, 1.0)
-            time.sleep(2.0 / SPEED)
-            assert not cf.supervisor.is_flying
-            cf.commander.send_notify_setpoint_stop()
-            wait_until(lambda: cf.supervisor.is_flying)
-
-
-@pytest.mark.slow
-def test_a_brushless_drone_needs_arming(tmp_path):
-    scenario = tmp_path / "brushless.toml"
-    scenario.write_text('platform = "cf21bl"\n')
-    with simulator("--speed", str(SPEED), "--scenario", str(scenario)) as uri, connected(uri) as cf:
-        assert not cf.supervisor.is_armed
-        assert not cf.supervisor.is_auto_armed
-        cf.supervisor.send_arming_request(True)
-        wait_until(lambda: cf.supervisor.can_fly)
-        fly(cf)
-        cf.high_level_commander.takeoff(0.5, 1.5)
-        wait_until(lambda: height(cf) == pytest.approx(0.5, abs=0.05))
-
-
-# What unmodified cflib can bear: late packets of every kind, log data that is lost, doubled or out of order. A single
-# lost reply hangs it for ever (crtp.md 7), which is why crazyem retries (tests/crazyem/test_links_*).
-LIGHT_FAULTS = """
-seed = 7
-[[fault]]
-what = "delay"
-ms = 1.0
-jitter_ms = 2.0
-[[fault]]
-what = "drop"
-rate = 0.05
-burst = 2.0
-kinds = ["log.data"]
-[[fault]]
-what = "duplicate"
-rate = 0.02
-kinds = ["log.data"]
-[[fault]]
-what = "reorder"
-rate = 0.02
-kinds = ["log.data"]
-"""
-
-
-@contextlib.contextmanager
-def relay(target, schedule):
-    """The fault relay in front of a simulator: its URI."""
-    command = [sys.executable, "-m", "firmware_sim.relay", target, "--schedule", str(schedule), "--json"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            yield process.stdout.readline().split()[1], process
-        finally:
-            process.terminate()
-
-
-@pytest.mark.slow
-def test_unmodified_cflib_connects_logs_writes_and_flies_behind_the_relay(tmp_path):
-    schedule = tmp_path / "light.toml"
-    schedule.write_text(LIGHT_FAULTS)
-    with simulator("--speed", str(SPEED)) as drone, relay(drone, schedule) as (uri, process):
-        with connected(uri) as cf:
-            blocks = {
-                "state": [f"stateEstimateZ.{n}" for n in ("x", "y", "z", "vx", "vy", "vz", "quat")],
-                "motors": [*(f"motor.m{n}" for n in range(1, 5)), "pm.vbatMV", "supervisor.info"],
-            }
-            data = collect(cf, blocks, 200)
-            stamps = [stamp for stamp, _ in data["state"]]
-            assert len(set(stamps)) < len(stamps)  # some came twice
-            assert max(stamps) - min(stamps) > 2000  # and some never
-            for n in range(20):
-                cf.param.set_value("supervisor.landedTimeout", str(3000 + n))
-            wait_until(lambda: cf.param.get_value("supervisor.landedTimeout") == "3019")
-            fly(cf)
-            cf.high_level_commander.takeoff(0.6, 1.5)
-            wait_until(lambda: height(cf) == pytest.approx(0.6, abs=0.05))
-            cf.high_level_commander.land(0.0, 1.5)
-            wait_until(lambda: not cf.supervisor.is_flying)
-        process.terminate()
-        account = json.loads(process.communicate(timeout=TIMEOUT)[0])
-    assert account["harmed"]["down"]["log.data"] > 20
-    assert account["harmed"]["down"].keys() >= {"param.toc", "param.write"}  # delayed

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from flights import boot, hold, read
 
 from firmware_sim.commander import setpoint as sp
 from firmware_sim.flight import Flight
 from firmware_sim.plant import layout as at
-from firmware_sim.scenario import parse_scenario
 
 PID, MELLINGER, LEE = 1, 2, 5
 QUIET = {"noise": {"thrust": 0.0, "torque": 0.0}}
@@ -14,12 +14,8 @@ QUIET = {"noise": {"thrust": 0.0, "torque": 0.0}}
 
 def hovering(controller: int) -> Flight:
     """At 1 m over the place (0, 0), by places."""
-    flight = Flight(parse_scenario({**QUIET, "parameters": {"stabilizer.controller": controller}}, "test"), 0)
-    s = flight.setpoint
-    s[sp.MODE_X : sp.MODE_Z + 1] = s[sp.MODE_YAW] = sp.ABSOLUTE
-    for n in range(4000):
-        s[sp.Z] = min(1.0, n / 2000)
-        flight.step()
+    flight = boot(QUIET, stabilizer__controller=controller)
+    hold(flight, (0.0, 0.0, 1.0), 4.0)
     return flight
 
 
@@ -33,34 +29,11 @@ def run(flight: Flight, seconds: float) -> np.ndarray:
     return np.array(rows)
 
 
-def fresh(flight: Flight) -> np.ndarray:
-    """An empty setpoint in the flight's array."""
-    flight.setpoint[:] = sp.null_setpoint()
-    return flight.setpoint
-
-
-@pytest.mark.parametrize("controller", [PID, MELLINGER, LEE])
-def test_hover_setpoints(controller: int) -> None:
-    """Velocity 0.2 m/s to the left at 1 m height, heading by rate (0)."""
-    flight = hovering(controller)
-    s = fresh(flight)
-    s[[sp.MODE_X, sp.MODE_Y, sp.MODE_YAW]] = sp.VELOCITY
-    s[sp.MODE_Z], s[sp.Z] = sp.ABSOLUTE, 1.0
-    s[sp.VY], s[sp.VELOCITY_BODY] = 0.2, 1.0
-    seen = run(flight, 3.0)
-    assert seen[:, 2] == pytest.approx(np.ones(len(seen)), abs=0.08)
-    if controller == PID:
-        assert seen[-50:, 4].mean() == pytest.approx(0.2, abs=0.04)
-    elif controller == MELLINGER:
-        assert np.abs(seen[:, 4]).max() < 0.05
-    else:  # Kpos_D (0.2 - 0) = Kpos_P (y - 0)
-        assert seen[-1, 1] == pytest.approx(4.0 * 0.2 / 7.0, abs=0.01)
-
-
 @pytest.mark.parametrize("controller", [PID, MELLINGER, LEE])
 def test_velocities_only(controller: int) -> None:
     flight = hovering(controller)
-    s = fresh(flight)
+    s = flight.setpoint
+    s[:] = sp.null_setpoint()
     s[[sp.MODE_X, sp.MODE_Y, sp.MODE_Z, sp.MODE_YAW]] = sp.VELOCITY
     s[sp.VZ] = 0.1
     seen = run(flight, 8.0 if controller == PID else 1.5)  # a change of modes empties PID's integrals: kp / ki = 1.7 s
@@ -97,14 +70,12 @@ def test_a_heading_held_by_pid_survives_a_change_of_modes() -> None:
     s = flight.setpoint
     s[sp.YAW] = 30.0
     run(flight, 0.1)  # on the way
-    array, index = flight.log["controller.yaw"]
-    assert array[index] == pytest.approx(30.0)
+    assert read(flight, "controller.yaw") == pytest.approx(30.0)
     s[sp.MODE_YAW] = sp.VELOCITY
     s[sp.MODE_X] = s[sp.MODE_Y] = sp.VELOCITY
     run(flight, 1.5)
-    assert array[index] == pytest.approx(30.0)
-    yaw = flight.log["stabilizer.yaw"]
-    assert yaw[0][yaw[1]] == pytest.approx(30.0, abs=3.0)
+    assert read(flight, "controller.yaw") == pytest.approx(30.0)
+    assert read(flight, "stabilizer.yaw") == pytest.approx(30.0, abs=3.0)
 
 
 @pytest.mark.parametrize("controller", [PID, MELLINGER])
@@ -113,7 +84,6 @@ def test_roll_pitch_and_yaw_of_legacy_controllers_are_whole_numbers(controller: 
     flight = hovering(controller)
     group = "controller" if controller == PID else "ctrlMel"
     for axis in ("roll", "pitch", "yaw"):
-        array, index = flight.log[f"{group}.cmd_{axis}"]
         for _ in range(20):
             flight.step()
-            assert array[index] == int(array[index])
+            assert read(flight, f"{group}.cmd_{axis}").is_integer()

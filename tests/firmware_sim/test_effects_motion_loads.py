@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from motion_model import INERTIA, MASS, PLAIN, STILL, C, G, Model, about_origin, compare, matrix, plant, seen
+from motion_model import INERTIA, MASS, PLAIN, STILL, C, G, Model, about_origin, advance, compare, matrix, plant, seen
 from scipy.spatial.transform import Rotation
 
 from firmware_sim.plant import layout as at
@@ -48,8 +48,7 @@ def test_a_wild_pendulum_keeps_energy_and_momentum() -> None:
     x[at.OMEGA : at.OMEGA + 3] = 10.0, -8.0, 6.0
     x[at.LOAD_RATE : at.LOAD_RATE + 3] = 15.0, 10.0, 0.0  # 1.8 m/s
     energy, momentum = energy_and_momentum(truth, x, 0.1)
-    for _ in range(2000):
-        plant_step_with_effects(truth, x, STILL, 1e-3)
+    advance(truth, x, 2000)
     end_energy, end_momentum = energy_and_momentum(truth, x, 0.1)
     assert end_energy == pytest.approx(energy, rel=2e-4)
     assert end_momentum == pytest.approx(momentum + 2.0 * 0.05 * G, abs=1e-6)
@@ -66,7 +65,7 @@ def test_process_noise_of_a_loaded_drone_is_an_impulse_through_the_string() -> N
     x[at.LOAD : at.LOAD + 3] = n / np.linalg.norm(n)
     kicked, noise = x.copy(), STILL.copy()
     noise[at.N_THRUST], noise[at.N_TORQUE : at.N_TORQUE + 3] = 1.3, (0.7, -1.1, 0.4)
-    plant_step_with_effects(truth, x, STILL, 1e-3)
+    advance(truth, x, 1)
     plant_step_with_effects(truth, kicked, noise, 1e-3)
     change = energy_and_momentum(truth, kicked, 0.2)[1] - energy_and_momentum(truth, x, 0.2)[1]
     up = Rotation.from_quat(seen(truth, x)[6:10]).as_matrix()[:, 2]
@@ -97,20 +96,17 @@ def on_the_floor(effects: dict, thrust: float) -> tuple[np.ndarray, np.ndarray]:
 )
 def test_the_floor_carries_body_and_load(effects: dict, mass: float) -> None:
     truth, x = on_the_floor(effects, 0.97 * mass * 9.81 / 4)
-    for _ in range(1500):
-        plant_step_with_effects(truth, x, STILL, 1e-3)
+    advance(truth, x, 1500)
     assert abs(seen(truth, x)[2]) < 1e-3
     assert np.abs(seen(truth, x)[[0, 1]]).max() < 2e-3
     truth, x = on_the_floor(effects, 1.05 * mass * 9.81 / 4)
-    for _ in range(1000):
-        plant_step_with_effects(truth, x, STILL, 1e-3)
+    advance(truth, x, 1000)
     assert seen(truth, x)[2] == pytest.approx(0.5 * 0.05 * 9.81, rel=0.2)
 
 
 def test_a_centre_of_mass_off_the_middle_stands_tilted_by_less_than_a_degree_and_feels_gravity() -> None:
     truth, x = on_the_floor({"center_of_mass": {"x": 0.01, "y": 0.0, "z": 0.0}}, 0.0)
-    for _ in range(1500):
-        plant_step_with_effects(truth, x, STILL, 1e-3)
+    advance(truth, x, 1500)
     assert 2 * abs(x[at.QUAT + 2]) < np.radians(1.0)
     assert x[at.ACC : at.ACC + 3] == pytest.approx([0, 0, 9.81], abs=0.2)
 

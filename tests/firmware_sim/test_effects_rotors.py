@@ -102,11 +102,6 @@ def test_a_fault_begins_at_its_time_with_its_rotor(rotor: int) -> None:
     assert rows[500:] == pytest.approx(np.tile(expected(weak), (500, 1)), rel=1e-9)
 
 
-def test_a_fault_without_onset_is_there_from_the_start() -> None:
-    truth, x = plant({"rotor_fault": {"rotor": 2, "scale": 0.9}}, motor_time_constant=0.0)
-    assert rotors(truth, x, 1)[0] == pytest.approx(expected(GOAL * [1, 0.9, 1, 1]), rel=1e-9)
-
-
 def test_torque_scale_leaves_the_force() -> None:
     truth, x = plant({"torque_scale": {"scale": 1.3}}, motor_time_constant=0.0)
     assert rotors(truth, x, 1)[0] == pytest.approx(expected(GOAL) * [1, 1.3, 1.3, 1.3], rel=1e-9)

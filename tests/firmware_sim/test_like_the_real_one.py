@@ -164,16 +164,6 @@ def test_a_setpoint_of_500_ms_levels_out_and_one_of_2000_ms_locks_until_reboot(c
     assert drone.height < 0.2
 
 
-def test_a_fresh_setpoint_ends_levelling_out():
-    drone = Drone(stabilizer__controller=LEE)
-    drone.run(3.0, lambda t: full_state((0, 0, min(1.0, t / 2))))
-    drone.run(1.5)
-    assert drone["ctrltarget.mode_x"] == 0
-    drone.run(1.0, lambda _t: full_state((0, 0, 1)))
-    assert drone["ctrltarget.mode_x"] == 1
-    assert drone.height == pytest.approx(1.0, abs=0.05)
-
-
 def test_the_zero_setpoint_of_close_link_cuts_the_motors_in_flight_and_locks_the_high_level_out():
     """[M]: the next take-off is silently without effect until a notice that the stream has stopped."""
     drone = Drone(stabilizer__controller=LEE)
@@ -193,19 +183,6 @@ def test_the_zero_setpoint_of_close_link_cuts_the_motors_in_flight_and_locks_the
     assert drone.motors == [0] * 4
     drone.run(2.5)
     assert drone.height < 0.1
-
-
-def test_thrust_by_hand_is_locked_until_a_zero_came():
-    drone = Drone()
-    lift = struct.pack("<fffH", 0.0, 0.0, 0.0, 45000)
-    drone.ask(wire.SETPOINT, 0, lift)
-    drone.firmware.advance(100)
-    assert drone.motors == [0] * 4
-    drone.ask(wire.SETPOINT, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, 0))
-    drone.firmware.advance(10)
-    drone.ask(wire.SETPOINT, 0, lift)
-    drone.firmware.advance(100)
-    assert min(drone.motors) > 20000
 
 
 # Sections 5 and 6: stops, arming, crashes
@@ -242,11 +219,6 @@ def test_the_stop_parameter_is_an_emergency_stop_too():
     drone.firmware.advance(120)
     drone.write("stabilizer.stop", 0)
     stays_locked(drone)
-
-
-def test_a_brushed_drone_idles_with_bits_0x020e():
-    """[M]."""
-    assert Drone().info == 0x020E
 
 
 def test_a_flipped_drone_is_crashed_and_flies_again_after_recovery():

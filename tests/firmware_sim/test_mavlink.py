@@ -208,22 +208,6 @@ def test_hover_thrust_is_held_within_bounds_and_only_taken_as_what_it_is(value, 
     assert echo.param_value == pytest.approx(before if after is None else after)
 
 
-def test_a_wrong_hover_thrust_is_a_wrong_height():
-    """The Lee controller has no integral in height: dm g = m kp dz."""
-    heights = []
-    for hover in (0.55, 0.65):
-        station = Station()
-        station.run(1500)
-        station.send(mavlink.MAVLink_param_set_message(1, 1, b"MPC_THR_HOVER", hover, 9))
-        station.command(22, *(0.0,) * 6, 1.0)
-        station.run(6000)
-        heights.append(station.firmware.flight.truth_row()[3])
-    kp = 7.0
-    for hover, height in zip((0.55, 0.65), heights, strict=True):
-        ratio = 0.029 * 9.81 / THRUST / hover  # true mass over believed mass
-        assert height - 1.0 == pytest.approx((1.0 - ratio) * 9.81 / kp, abs=0.06)
-
-
 # --- commands ---
 
 

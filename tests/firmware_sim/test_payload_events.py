@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from flights import write
 from scipy.spatial.transform import Rotation
 
 from firmware_sim.commander import setpoint as sp
@@ -96,8 +97,7 @@ def test_momentum_is_conserved_by_a_payload_that_is_caught(velocity):
 def hover(flying, seconds, seed=1):
     """Heights [m] and true masses [kg] at 100 Hz of a flight that takes off to 0.5 m by a position setpoint."""
     drone, rows = Flight(flying, seed), []
-    drone._param[drone.param["stabilizer.controller"][1]] = 5.0
-    drone.parameter_written("stabilizer.controller")
+    write(drone, "stabilizer.controller", 5.0)
     drone.setpoint[sp.MODE_X : sp.MODE_Z + 1] = sp.ABSOLUTE
     drone.setpoint[sp.X : sp.Z + 1] = (0.0, 0.0, 0.5)
     for k in range(round(1000 * seconds)):

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
 
+from firmware_sim.commander.decode import decompress_quaternion
 from firmware_sim.controllers.tick import plant_step
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.quaternion import compress
@@ -23,6 +24,12 @@ def airborne(table: dict | None = None) -> tuple[np.ndarray, np.ndarray, Scenari
     return scenario.truth(), scenario.start_state(), scenario
 
 
+def advance(truth: np.ndarray, x: np.ndarray, milliseconds: int) -> None:
+    """Let the plant move without noise."""
+    for _ in range(milliseconds):
+        plant_step(truth, x, STILL, 1e-3)
+
+
 def rotation(q: np.ndarray) -> np.ndarray:
     """Rotation matrix of q = w, x, y, z by the sandwich product, written out independently of the package."""
     w, v = q[0], q[1:4]
@@ -33,8 +40,7 @@ def rotation(q: np.ndarray) -> np.ndarray:
 def test_free_fall_is_a_parabola() -> None:
     truth, x, _ = airborne()
     x[at.VEL : at.VEL + 3] = 1.0, -2.0, 3.0
-    for _ in range(1000):
-        plant_step(truth, x, STILL, 1e-3)
+    advance(truth, x, 1000)
     assert x[at.POS : at.POS + 3] == pytest.approx([1.0, -2.0, 3.0 - 0.5 * 9.81], abs=1e-9)
     assert x[at.ACC : at.ACC + 3] == pytest.approx([0, 0, 0], abs=1e-9)
 
@@ -45,8 +51,7 @@ def test_free_rotation_conserves_energy_and_angular_momentum() -> None:
     x[at.OMEGA : at.OMEGA + 3] = 8.0, -5.0, 3.0
     omega = x[at.OMEGA : at.OMEGA + 3]
     energy, momentum = omega @ J @ omega, rotation(x[at.QUAT : at.QUAT + 4]) @ J @ omega
-    for _ in range(3000):
-        plant_step(truth, x, STILL, 1e-3)
+    advance(truth, x, 3000)
     assert omega @ J @ omega == pytest.approx(energy, rel=1e-6)
     assert rotation(x[at.QUAT : at.QUAT + 4]) @ J @ omega == pytest.approx(momentum, rel=1e-6)
     assert np.linalg.norm(x[at.QUAT : at.QUAT + 4]) == pytest.approx(1.0, abs=1e-12)
@@ -115,12 +120,7 @@ def test_compressed_quaternion_comes_back(values: list[float]) -> None:
     q = np.array(values) / np.linalg.norm(values)  # x, y, z, w
     packed = int(compress(q[3], q[0], q[1], q[2]))
     assert 0 <= packed < 2**32
-    largest, out = packed >> 30, np.zeros(4)
-    for i in (3, 2, 1, 0):  # unpacked as cflib does it: last packed first
-        if i != largest:
-            out[i] = (packed & 0x1FF) / 511 / np.sqrt(2) * (-1 if packed >> 9 & 1 else 1)
-            packed >>= 10
-    out[largest] = np.sqrt(max(0.0, 1 - out @ out))
+    out = np.array(decompress_quaternion(packed))  # cflib is its oracle, in test_commander_supervisor.py
     assert abs(out @ q) == pytest.approx(1.0, abs=3e-6)  # 0.16 degrees and no axis mixed up
     assert min(np.abs(out - q).max(), np.abs(out + q).max()) < 2.5e-3
 
@@ -157,8 +157,7 @@ def test_leaves_the_floor_when_thrust_exceeds_weight(fraction: float, leaves: bo
 
 def test_resting_reads_one_g() -> None:
     truth, x = drone(0.0)
-    for _ in range(10):
-        plant_step(truth, x, STILL, 1e-3)
+    advance(truth, x, 10)
     assert x[at.ASLEEP] == 1.0
     assert x[at.ACC : at.ACC + 3] == pytest.approx([0, 0, 9.81])
 
@@ -166,8 +165,7 @@ def test_resting_reads_one_g() -> None:
 @pytest.mark.parametrize("speed", [0.0, 0.5, 3.0])
 def test_a_fall_ends_at_rest_on_the_floor(speed: float) -> None:
     truth, x = drone(0.0, {"position": [0.0, 0.0, 0.5], "velocity": [speed, 0.0, -speed]})
-    for _ in range(4000):
-        plant_step(truth, x, STILL, 1e-3)
+    advance(truth, x, 4000)
     assert x[at.ASLEEP] == 1.0
     assert abs(x[at.POS + 2]) < 1e-3
     up = 1 - 2 * (x[at.QUAT + 1] ** 2 + x[at.QUAT + 2] ** 2)

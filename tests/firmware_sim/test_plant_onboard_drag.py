@@ -5,14 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from firmware_sim.commander import setpoint as sp
 from firmware_sim.controllers import parameters as pm
 from firmware_sim.controllers import variables as lv
 from firmware_sim.controllers.externalise import BARO_NOISE, log_baro
-from firmware_sim.flight import Flight
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.onboard_estimate import drag, integrate, predict
-from firmware_sim.scenario import parse_scenario
 
 DT = 1e-3
 
@@ -28,13 +25,6 @@ def estimate(velocity: tuple, yaw: float = 0.0, rate: tuple = (0.0, 0.0, 0.0)) -
     e[at.E_QUAT], e[at.E_QUAT + 3] = math.cos(yaw / 2), math.sin(yaw / 2)
     e[at.E_GYRO : at.E_GYRO + 3] = rate
     return e
-
-
-def test_without_drag_nothing_changes() -> None:
-    e = estimate((1.0, 2.0, 3.0), 0.3)
-    before = e.copy()
-    drag(e, parameters(cop_x=0.1), DT)
-    assert np.array_equal(e, before)
 
 
 def test_speed_decays_by_drag_b_a_second_in_body_axes() -> None:
@@ -86,30 +76,3 @@ def test_in_the_air_only_the_accelerometers_z_moves_the_estimate(flying: bool) -
     integrate(e, 0.01, flying)
     expected = [0.0, 0.0, 0.19e-2] if flying else [0.4e-2, -0.3e-2, 0.19e-2]
     assert e[at.E_VEL : at.E_VEL + 3] == pytest.approx(expected, abs=1e-12)
-
-
-def velocity_error(drag_b: float) -> float:
-    """Rms of the onboard velocity along x and y against the truth, m/s: 5 s of a circle of 1.5 m/s, 0.012 N s/m."""
-    told = {f"kalman.dragB_{axis}": drag_b for axis in "xy"}
-    table = {"effects": {"linear_drag": {"x": 0.012, "y": 0.012, "z": 0.0}}}
-    scenario = parse_scenario({**table, "parameters": {"stabilizer.controller": 5.0, **told}}, "test")
-    flight, errors = Flight(scenario, 3), []
-    flight.flying = True
-    s, w = flight.setpoint, 2.0
-    s[sp.MODE_X : sp.MODE_Z + 1] = s[sp.MODE_YAW] = sp.ABSOLUTE
-    for n in range(9000):
-        t, r = n / 1000.0, 0.75 * min(1.0, n / 3000)
-        s[sp.X], s[sp.Y], s[sp.Z] = r * math.sin(w * t), r * math.cos(w * t), min(1.0, n / 1500)
-        s[sp.VX], s[sp.VY] = r * w * math.cos(w * t), -r * w * math.sin(w * t)
-        flight.step()
-        if n > 4000 and n % 10 == 0:
-            v = [flight.log[f"stateEstimate.v{axis}"] for axis in "xy"]
-            errors.append([a[i] - flight.state[at.VEL + k] for k, (a, i) in enumerate(v)])
-    return float(np.sqrt(np.mean(np.square(errors))))
-
-
-def test_told_of_the_drag_the_filter_errs_less() -> None:
-    """0.012 N s/m at 29 g are 0.41 1/s."""
-    without, told = velocity_error(0.0), velocity_error(0.012 / 0.029)
-    assert without > 0.02
-    assert told < 2.0 / 3.0 * without

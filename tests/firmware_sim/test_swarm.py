@@ -138,26 +138,6 @@ def test_every_drone_answers_its_own_client_and_no_other():
         assert len({server.client for server in many.servers}) == 3
 
 
-def flown(drone, chunks):
-    """Truth after so many ms in the air: a drone hanging at 1 m falls, bounces and stops."""
-    from firmware_sim.firmware import Firmware
-    from firmware_sim.flight import Flight
-
-    scenario = drone.load()
-    firmware = Firmware(Flight(scenario, drone.seed), platform=scenario.platform, seed=drone.seed)
-    for chunk in chunks:
-        firmware.advance(chunk)
-    return firmware.flight.truth_row()
-
-
-def test_same_seed_same_flight_whoever_else_is_there():
-    above = [swarm.replace(d, position=(0.0, 0.0, 1.0)) for d in swarm.of_number(3, port=0, seed=4)]
-    alone = flown(above[1], [700])
-    side_by_side = [flown(d, [20] * 35) for d in above]
-    assert side_by_side[1] == alone
-    assert side_by_side[0] != side_by_side[2]  # other seeds, other flights
-
-
 def test_a_drone_with_nothing_to_send_gets_its_turn_all_the_same():
     class Log:
         due = None
