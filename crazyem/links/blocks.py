@@ -15,7 +15,7 @@ from crazyem.links.base import LinkLost, LinkStatistics
 from crazyem.links.clock import ClockFit, ClockRelation, LossCounter, StampUnwrapper
 from crazyem.links.log_control import LogControl
 from crazyem.links.packing import PERIOD_UNIT_MS, pack, period_of
-from crazyem.links.requests import RequestClient
+from crazyem.links.requests import RequestClient, types_of
 from crazyem.signals.sample import Block, Packet
 
 LATE_AFTER = 0.1  # s of delay over the least-delayed packets, above which a packet is late
@@ -23,10 +23,8 @@ _START_ATTEMPT = 0.5  # s to wait for a block's first packet, in addition to its
 _START_ATTEMPTS = 4
 _DELAY_SAMPLES = 500  # newest packets of a block, for the median and 99th percentile of their delays
 _BACKWARDS_MS = 200  # ms; a clock that goes back by more was reset
-_AHEAD_SECONDS, _FASTEST_CLOCK_RATIO = (
-    2.0,
-    3.0,
-)  # s, and factor on the time by the clock relation: a simulator that stopped for a while catches up faster
+_AHEAD_SECONDS = 2.0  # s
+_FASTEST_CLOCK_RATIO = 3.0  # on the time by the clock relation: a simulator that stopped for a while catches up faster
 
 
 class LogBlocks:
@@ -73,8 +71,7 @@ class LogBlocks:
 
     def available(self) -> Mapping[str, str]:
         """Name -> C type of everything the firmware can log."""
-        table = self._cf.log.toc.toc
-        return {f"{group}.{name}": item.ctype for group, items in table.items() for name, item in items.items()}
+        return types_of(self._cf.log.toc)
 
     # --- starting ---------------------------------------------------------------------------------------------------
 
@@ -167,8 +164,7 @@ class LogBlocks:
                 self._cf.log.log_blocks.remove(config)
         self._running.clear()
         if self._requests is not None:
-            with contextlib.suppress(ValueError):
-                self._requests.close()
+            self._requests.close()
 
     # --- receiving --------------------------------------------------------------------------------------------------
 

@@ -8,6 +8,7 @@ import contextlib
 import logging
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from crazyem.errors import LinkError
@@ -59,11 +60,23 @@ def new_crazyflie(uri: str) -> Any:
     return crazyflie
 
 
+def add_callbacks(*pairs: tuple[Any, Callable[..., None]]) -> Callable[[], None]:
+    """Add a callback to each of cflib's callers; returns a function that removes them, if they are still there."""
+    for caller, callback in pairs:
+        caller.add_callback(callback)
+
+    def remove() -> None:
+        for caller, callback in pairs:
+            with contextlib.suppress(ValueError):
+                caller.remove_callback(callback)
+
+    return remove
+
+
 class _Progress:
     """Watches a connection attempt from cflib's callbacks; never raises in cflib's threads."""
 
     def __init__(self, crazyflie: Any) -> None:
-        self._cf = crazyflie
         self.wake = threading.Event()
         self.done = False
         self.failure = ""
@@ -71,22 +84,13 @@ class _Progress:
         self._seen: set[tuple[int, int, bytes]] = set()
         self.last_answer = time.monotonic()
         self.awaited = ""
-        crazyflie.packet_sent.add_callback(self._sent)
-        crazyflie.packet_received.add_callback(self._received)
-        crazyflie.fully_connected.add_callback(self._connected)
-        crazyflie.connection_failed.add_callback(self._failed)
-        crazyflie.connection_lost.add_callback(self._failed)
-
-    def detach(self) -> None:
-        for caller, callback in (
-            (self._cf.packet_sent, self._sent),
-            (self._cf.packet_received, self._received),
-            (self._cf.fully_connected, self._connected),
-            (self._cf.connection_failed, self._failed),
-            (self._cf.connection_lost, self._failed),
-        ):
-            with contextlib.suppress(ValueError):
-                caller.remove_callback(callback)
+        self.detach = add_callbacks(
+            (crazyflie.packet_sent, self._sent),
+            (crazyflie.packet_received, self._received),
+            (crazyflie.fully_connected, self._connected),
+            (crazyflie.connection_failed, self._failed),
+            (crazyflie.connection_lost, self._failed),
+        )
 
     def _sent(self, packet: Any) -> None:
         stage = _STAGES.get((packet.port, packet.channel))
@@ -239,16 +243,24 @@ def shut(crazyflie: Any, *, hand_back: bool = False, cut_motors: bool = False) -
                 crazyflie.commander.send_notify_setpoint_stop()
             shorten_socket_timeout(crazyflie)
             crazyflie.link_statistics.latency.ping()  # its echo wakes the receiver
-    link = take_link(crazyflie)  # sending may have failed and closed it
-    if link is not None:
-        _wake(crazyflie, link)
-        with contextlib.suppress(Exception):
-            link.close()
+    close_driver(crazyflie)  # sending may have failed and closed it
     with contextlib.suppress(Exception):
         crazyflie.close_link()
 
 
-def take_link(crazyflie: Any) -> Any:
+def close_driver(crazyflie: Any) -> None:
+    """Remove the driver from the object, wake cflib's dispatcher, which otherwise notices a stop late, and close it."""
+    link = _take_link(crazyflie)
+    if link is None:
+        return
+    with contextlib.suppress(Exception):
+        crazyflie.incoming.stop()
+        link.in_queue.put(None)
+    with contextlib.suppress(Exception):
+        link.close()
+
+
+def _take_link(crazyflie: Any) -> Any:
     """Remove the driver from the object, but not during a send: the sender would end with cflib's lock held."""
     lock: Any = getattr(crazyflie, "_send_lock", None)
     held = lock is not None and lock.acquire(timeout=0.5)
@@ -265,10 +277,3 @@ def shorten_socket_timeout(crazyflie: Any) -> None:
     with contextlib.suppress(Exception):
         if crazyflie.link.socket.gettimeout() is not None:
             crazyflie.link.socket.settimeout(0.1)
-
-
-def _wake(crazyflie: Any, link: Any) -> None:
-    """Wake cflib's dispatcher, which otherwise notices a stop only after a second."""
-    with contextlib.suppress(Exception):
-        crazyflie.incoming.stop()
-        link.in_queue.put(None)

@@ -1,6 +1,5 @@
 """A link to a Crazyflie over unmodified cflib, with time limits, counts of losses, and one report of a lost drone."""
 
-import contextlib
 import math
 import queue
 import statistics
@@ -16,7 +15,7 @@ from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import AnotherDroneError, LinkLost, LinkStatistics, Outage, ParameterWrite
 from crazyem.links.blocks import LogBlocks
 from crazyem.links.clock import ClockFit
-from crazyem.links.connection import connect, quiet_cflib, shut
+from crazyem.links.connection import add_callbacks, connect, quiet_cflib, shut
 from crazyem.links.parameters import ParameterClient
 from crazyem.links.reconnection import Reconnector
 from crazyem.links.requests import land_command, send_until_confirmed
@@ -93,9 +92,11 @@ class CrazyflieLink:
         self._reconnector = Reconnector(crazyflie, self.uri) if self._owned else None
         self._lost, self._unrecoverable = "", False
         self._last_echo = None
-        crazyflie.connection_lost.add_callback(self._on_connection_lost)
-        crazyflie.disconnected.add_callback(self._on_disconnected)
-        crazyflie.packet_received.add_callback(self._on_any_packet)
+        self._remove_callbacks = add_callbacks(
+            (crazyflie.connection_lost, self._on_connection_lost),
+            (crazyflie.disconnected, self._on_disconnected),
+            (crazyflie.packet_received, self._on_any_packet),
+        )
         self._last_packet = time.monotonic()
         self._stop.clear()
         self._watcher = threading.Thread(target=self._watch, name="crazyem-link-watch", daemon=True)
@@ -115,21 +116,14 @@ class CrazyflieLink:
         if self._parameters is not None:
             self._parameters.close()
             self._parameters = None
-        for caller, callback in (
-            (crazyflie.connection_lost, self._on_connection_lost),
-            (crazyflie.disconnected, self._on_disconnected),
-            (crazyflie.packet_received, self._on_any_packet),
-        ):
-            with contextlib.suppress(ValueError):
-                caller.remove_callback(callback)
+        self._remove_callbacks()
         if self._owned:
             shut(crazyflie, hand_back=self._commanded, cut_motors=self._commanded)
         if self._watcher is not None:
             self._watcher.join(timeout=1.0)
 
     def __enter__(self) -> "CrazyflieLink":
-        if self._cf is None:
-            self.connect()
+        self.connect()
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,24 +1,20 @@
 """Reading and writing parameters over a cflib Crazyflie, verified and with our own time limits.
 
 cflib's own writer waits for ever for a lost echo and blocks all later writes. This module does not use it: packets are
-sent through `Crazyflie.send_packet`, repeated without an answer (a write is idempotent), and matched to their echo by a
-port callback. So a lost echo costs only one unverified write.
+sent by a `RequestClient`, which repeats them without an answer (a write is idempotent) and matches them to their echo.
+So a lost echo costs only one unverified write.
 """
 
-import functools
-import queue
 import struct
-import threading
 import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import ParameterWrite
-from crazyem.links.requests import replies, send
+from crazyem.links.requests import RequestClient, types_of
 
-_READ_CHANNEL = 1
-_WRITE_CHANNEL = 2
+_PORT, _READ_CHANNEL, _WRITE_CHANNEL = 2, 1, 2
 _RESEND_AFTER = 0.3  # s
 
 
@@ -31,36 +27,26 @@ class ParameterClient:
 
     def __init__(self, crazyflie: Any, uri: str) -> None:
         self.fault = ""
-        self._cf = crazyflie
-        self._uri = uri
-        self._lock = threading.Lock()
-        self._waiting: tuple[int, bytes] | None = None
-        self._replies: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        from cflib.crtp.crtpstack import CRTPPort
-
-        self._port = CRTPPort.PARAM
-        crazyflie.add_port_callback(self._port, self._on_packet)
+        self._cf, self._uri = crazyflie, uri
+        self._requests = RequestClient(crazyflie)
 
     def close(self) -> None:
         """Stop listening."""
-        self._cf.remove_port_callback(self._port, self._on_packet)
+        self._requests.close()
 
     def types(self) -> Mapping[str, str]:
         """All parameters: name -> C type."""
-        table = self._cf.param.toc.toc
-        return {f"{group}.{name}": item.ctype for group, items in table.items() for name, item in items.items()}
+        return types_of(self._cf.param.toc)
 
     def read(self, name: str, timeout: float) -> float:
         """The present value in the firmware. Raises UsageError (unknown name) or LinkError (no answer in time)."""
         element = self._element(name)
-        identifier = struct.pack("<H", element.ident)
-        with self._lock:
-            for reply in self._replies_to(_READ_CHANNEL, identifier, identifier, timeout):
-                value = _decode(element.pytype, reply[3:])
-                if reply[2] == 0 and value is not None:
-                    self.fault = ""
-                    return value
-                raise LinkError(f"The drone refused to read the parameter {name} (error {reply[2]}).")
+        for reply in self._replies_to(_READ_CHANNEL, struct.pack("<H", element.ident), timeout):
+            value = _decode(element.pytype, reply[3:])
+            if reply[2] == 0 and value is not None:
+                self.fault = ""
+                return value
+            raise LinkError(f"The drone refused to read the parameter {name} (error {reply[2]}).")
         self.fault = f"The drone at {self._uri} did not answer a read of {name} within {timeout:g} s."
         raise LinkError(self.fault)
 
@@ -72,17 +58,15 @@ class ParameterClient:
         element = self._element(name)
         if element.access == element.RO_ACCESS:
             raise UsageError(f"The parameter {name} is read-only.")
-        identifier = struct.pack("<H", element.ident)
-        payload = identifier + _encode(name, element, value)
+        payload = struct.pack("<H", element.ident) + _encode(name, element, value)
         echoed: float | None = None
-        with self._lock:
-            for reply in self._replies_to(_WRITE_CHANNEL, identifier, payload, timeout):
-                echoed = _decode(element.pytype, reply[2:])
-                # An echo with another value belongs to an earlier write: keep waiting for ours.
-                if reply == payload:
-                    self.fault = ""
-                    self._remember(element, echoed)
-                    return ParameterWrite(name, value, echoed, True, time.time())
+        for reply in self._replies_to(_WRITE_CHANNEL, payload, timeout):
+            echoed = _decode(element.pytype, reply[2:])
+            # An echo with another value belongs to an earlier write: keep waiting for ours.
+            if reply == payload:
+                self.fault = ""
+                self._remember(element, echoed)
+                return ParameterWrite(name, value, echoed, True, time.time())
         self.fault = (
             f"The drone at {self._uri} did not confirm {name} = {value:g} within {timeout:g} s."
             if echoed is None
@@ -90,24 +74,14 @@ class ParameterClient:
         )
         return ParameterWrite(name, value, echoed, False, time.time())
 
-    def _replies_to(self, channel: int, identifier: bytes, payload: bytes, timeout: float) -> Iterator[bytes]:
-        """Repeat the request until `timeout`, and yield each reply on the channel with the identifier."""
+    def _replies_to(self, channel: int, payload: bytes, timeout: float) -> Iterator[bytes]:
+        """Repeat the request until `timeout`, and yield each reply on the channel with the same identifier."""
         if self._cf.is_called_by_incoming_handler_thread():
             raise UsageError("Parameters cannot be accessed from inside a cflib callback.")
-        self._waiting = (channel, identifier)
-        try:
-            ask = functools.partial(send, self._cf, self._port, channel, payload)
-            yield from replies(ask, self._replies, timeout=timeout, repeat_after=_RESEND_AFTER)
-        finally:
-            self._waiting = None
-
-    def _on_packet(self, packet: Any) -> None:
-        """Take a packet in cflib's thread; must not raise, or cflib's own parameter thread ends."""
-        waiting = self._waiting
-        if waiting is not None and packet.channel == waiting[0]:
-            data = bytes(packet.data)
-            if data[:2] == waiting[1] and len(data) > 2:
-                self._replies.put(data)
+        key = (_PORT, channel, payload[:2])
+        for reply in self._requests.replies(key, payload, timeout=timeout, repeat_after=_RESEND_AFTER):
+            if len(reply) > 2:
+                yield reply
 
     def _element(self, name: str) -> Any:
         element = self._cf.param.toc.get_element_by_complete_name(name) if name.count(".") == 1 else None

@@ -1,6 +1,5 @@
 """Reconnection of a lost link without reading the tables again, because it is the same drone."""
 
-import contextlib
 import datetime
 import threading
 import time
@@ -9,7 +8,7 @@ from typing import Any
 from crazyem.errors import LinkError
 from crazyem.links.base import AnotherDroneError
 from crazyem.links.blocks import LogBlocks
-from crazyem.links.connection import new_driver, shorten_socket_timeout, take_link
+from crazyem.links.connection import close_driver, new_driver, shorten_socket_timeout
 from crazyem.links.requests import RetryTransport
 
 _TABLE_PORTS = (5, 2)  # ports: log, parameters
@@ -70,14 +69,9 @@ class Reconnector:
         cf = self._cf
         from cflib.crazyflie import State
 
-        old = take_link(cf)
         callbacks = list(cf.incoming.cb)
+        close_driver(cf)
         cf.incoming.stop()
-        if old is not None:
-            with contextlib.suppress(Exception):
-                old.in_queue.put(None)
-            with contextlib.suppress(Exception):
-                old.close()
         cf.incoming = type(cf.incoming)(cf)
         cf.incoming.cb = callbacks
         cf.state = State.DISCONNECTED

@@ -8,6 +8,7 @@ The same holds for high-level commands: cflib sends a command to port 8 once and
 each with its first byte, two more, and an error (crtp_commander_high_level.c).
 """
 
+import contextlib
 import functools
 import queue
 import struct
@@ -67,6 +68,11 @@ def send(crazyflie: Any, port: int, channel: int, data: bytes) -> bool:
     packet.data = data
     crazyflie.send_packet(packet)
     return True
+
+
+def types_of(table: Any) -> dict[str, str]:
+    """Name -> C type of everything in a table of contents of cflib."""
+    return {f"{group}.{name}": item.ctype for group, items in table.toc.items() for name, item in items.items()}
 
 
 def key_of(port: int, channel: int, data: bytes) -> Key | None:
@@ -176,7 +182,8 @@ class RequestClient:
 
     def close(self) -> None:
         """Stop listening."""
-        self._cf.packet_received.remove_callback(self._on_packet)
+        with contextlib.suppress(ValueError):
+            self._cf.packet_received.remove_callback(self._on_packet)
 
     def request(
         self, port: int, channel: int, data: bytes, *, timeout: float, repeat_after: float | None
@@ -189,19 +196,27 @@ class RequestClient:
         """
         if self._cf.is_called_by_incoming_handler_thread():
             raise UsageError("The drone cannot be asked from inside a cflib callback.")
+        key = key_of(port, channel, data)
+        assert key is not None
+        return next(self.replies(key, data, timeout=timeout, repeat_after=repeat_after), None)
+
+    def replies(self, key: Key, data: bytes, *, timeout: float, repeat_after: float | None) -> Iterator[bytes]:
+        """Send a request to the port and channel of its key; yield the data of each reply with this key, in time."""
+        port, channel, _ = key
         with self._lock:
-            self._waiting = key_of(port, channel, data)
+            self._waiting = key
             try:
                 ask = functools.partial(send, self._cf, port, channel, data)
-                return next(replies(ask, self._replies, timeout=timeout, repeat_after=repeat_after), None)
+                yield from replies(ask, self._replies, timeout=timeout, repeat_after=repeat_after)
             finally:
                 self._waiting = None
 
     def _on_packet(self, packet: Any) -> None:
+        """Take a packet in cflib's thread; must not raise, or this thread ends."""
         waiting = self._waiting
         if waiting is not None and (packet.port, packet.channel) == waiting[:2]:
             data = bytes(packet.data)
-            if key_of(packet.port, packet.channel, data) == waiting:
+            if data.startswith(waiting[2]):
                 self._replies.put(data)
 
 

@@ -60,7 +60,7 @@ def test_a_bad_air_costs_cflib_log_packets_only(resting):
         scf.wait_for_params()
         data = {"kinds": ("log.data",)}
         now_on(relay, down("drop", rate=0.33, burst=3.0, **data), down("duplicate", rate=0.2, **data),
-               down("reorder", rate=0.2, **data), down("delay", jitter_ms=30.0, **data))  # fmt: skip
+               down("reorder", rate=0.2, **data), down("delay", jitter_ms=30.0))  # fmt: skip
         assert logs(scf.cf)
         assert scf.cf.is_connected()
 

@@ -77,11 +77,6 @@ def test_hover_thrust_is_the_old_one_times_the_ratio_of_masses(ratio, hover):
     assert decision.writes[0][1] == pytest.approx(hover * ratio, rel=1e-9)
 
 
-def test_one_write_goes_no_further_than_the_policy_lets_it():
-    decision = decide(guard_of(Drone(0.5)), 1.4 * CF2.mass)
-    assert decision.writes == (("MPC_THR_HOVER", pytest.approx(0.5 * 1.15)),)
-
-
 def test_beyond_the_bounds_of_hover_thrust_nothing_is_written():
     high = decide(guard_of(Drone(0.75)), 1.1 * CF2.mass)
     assert not high.writes

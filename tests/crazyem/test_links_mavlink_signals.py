@@ -61,14 +61,6 @@ def test_attitudes_are_the_rotation_matrix_turned_on_both_sides(angles, rates):
         assert found["body_rate"] == pytest.approx(D @ rates)
 
 
-@pytest.mark.parametrize(
-    ("ned_yaw", "nwu_x_axis"), [(0.0, (1, 0, 0)), (math.pi / 2, (0, -1, 0)), (math.pi, (-1, 0, 0))]
-)
-def test_a_nose_to_the_east_points_along_minus_y(ned_yaw, nwu_x_axis):
-    found = signals(mavlink.MAVLink_attitude_message(1000, 0, 0, ned_yaw, 0, 0, 0))
-    assert Rotation.from_quat(found["attitude"]).apply([1, 0, 0]) == pytest.approx(nwu_x_axis, abs=1e-6)
-
-
 def test_nose_up_and_right_wing_down_keep_their_meaning():
     """Pitch up in FRD: the nose points up, in our world to +z. Roll right: the left wing points up."""
     up = signals(mavlink.MAVLink_attitude_message(1000, 0, 0.5, 0, 0, 0, 0))

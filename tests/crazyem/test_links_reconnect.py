@@ -123,11 +123,16 @@ def test_a_flight_goes_on_after_an_outage(scheduler):
     assert [e.samples for e in session.history.estimates] == sorted(e.samples for e in session.history.estimates)
 
 
-def test_an_outage_that_lasts_ends_the_flight_in_one_sentence(scheduler):
+@pytest.mark.parametrize(
+    ("can_reconnect", "message"),
+    [(True, r"^the drone at fake://0 was lost: it was away; the drone did not come back\.$"),
+     (False, r"was lost: it was away\.$")],
+    ids=["it stays away", "it cannot come back"],
+)  # fmt: skip
+def test_an_outage_that_lasts_ends_the_flight_in_one_sentence(scheduler, can_reconnect, message):
     link = LosingLink(speed=5.0, comes_back=False)
-    with pytest.raises(
-        LinkError, match=r"^the drone at fake://0 was lost: it was away; the drone did not come back\.$"
-    ):
+    link.can_reconnect = can_reconnect
+    with pytest.raises(LinkError, match=message):
         fly(link, scheduler=scheduler)
 
 
@@ -156,13 +161,6 @@ def test_after_a_restart_of_the_firmware_the_notes_agree(scheduler):
     assert [n for n in notes if "of its start" in n]
     assert not [n for n in notes if "put back" in n or "written back" in n or "may keep" in n]
     assert all(math.isnan(v) for v in session.history.guard["in_drone"].values())
-
-
-def test_a_link_that_cannot_come_back_is_not_asked(scheduler):
-    link = LosingLink(speed=5.0)
-    link.can_reconnect = False
-    with pytest.raises(LinkError, match="was lost: it was away"):
-        fly(link, scheduler=scheduler)
 
 
 def test_a_write_that_falls_into_an_outage_is_made_up_for(scheduler):

@@ -1,6 +1,4 @@
-"""The link against the simulated firmware: real tables, real blocks, a verified write, a take-off."""
-
-import struct
+"""The link against the simulated firmware: real tables, real blocks, a take-off."""
 
 import pytest
 from received import packets
@@ -24,14 +22,6 @@ def test_standard_blocks_stream_at_100_hz(resting):
     force = [s.value for s in samples if s.signal == "specific_force"]
     mean = [sum(v[i] for v in force) / len(force) for i in range(3)]
     assert mean == pytest.approx([0.0, 0.0, 9.81], abs=0.1)  # at rest on the ground
-
-
-def test_parameters_read_and_write(resting):
-    with CrazyflieLink(resting.uri) as link:
-        assert link.parameters["ctrlLee.mass"] == "float"
-        write = link.write_parameter("ctrlLee.mass", 0.0312)
-        assert write.verified
-        assert link.read_parameter("ctrlLee.mass") == struct.unpack("<f", struct.pack("<f", 0.0312))[0]
 
 
 def test_a_second_client_can_take_off_after_the_first_has_commanded(resting):

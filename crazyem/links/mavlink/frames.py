@@ -32,7 +32,9 @@ class Definition:
     fields: tuple[tuple[str, int], ...]
 
 
-def _definitions() -> dict[int, Definition]:
+@cache
+def definitions() -> Mapping[int, Definition]:
+    """Message number -> definition."""
     found = {}
     for number, message in ardupilotmega.mavlink_map.items():
         counts = [n if code != "s" else 0 for n, code in layout(message.unpacker.format)]
@@ -48,12 +50,6 @@ def _definitions() -> dict[int, Definition]:
 def layout(form: str) -> list[tuple[int, str]]:
     """Count and letter of each part of a struct format."""
     return [(int(count or 1), letter) for count, letter in re.findall(r"(\d*)([a-zA-Z])", form)]
-
-
-@cache
-def definitions() -> Mapping[int, Definition]:
-    """Message number -> definition."""
-    return _definitions()
 
 
 @cache
@@ -211,9 +207,7 @@ class SequenceCounter:
             self.lost += ahead - 1
             self._missing.update(range(self._newest + 1, self._newest + ahead))
             self._newest += ahead
-            self._missing = (
-                {n for n in self._missing if n > self._newest - _LATE_NUMBERS} if self._missing else self._missing
-            )
+            self._missing = {n for n in self._missing if n > self._newest - _LATE_NUMBERS}
         elif ahead:  # 0: 256 lost, or a sender without sequence numbers
             self.late += 1
             number = self._newest + ahead - _MODULUS

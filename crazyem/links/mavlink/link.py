@@ -84,7 +84,9 @@ class MavlinkLink:
         return f"no heartbeat of {chosen} came at {self.uri} within {timeout:g} s.{others}{noise}"
 
     def _identify(self, receiver: Receiver) -> None:
-        wanted = [*motors.wanted(receiver.autopilot), *self._hover_names()]
+        wanted = list(motors.wanted(receiver.autopilot))
+        if receiver.autopilot in HOVER_PARAMETERS:
+            wanted += [HOVER_PARAMETERS[receiver.autopilot], ONBOARD_HOVER_ESTIMATORS[receiver.autopilot][0]]
 
         def complete() -> bool:
             version = attempt > 0 or "AUTOPILOT_VERSION" in receiver.seen  # not all autopilots send one
@@ -98,10 +100,6 @@ class MavlinkLink:
             if self._wait(complete, 0.3 * (attempt + 1)):
                 break
         self.outputs = receiver.streams.outputs = motors.Outputs.of(receiver.autopilot, self._parameters.known)
-
-    def _hover_names(self) -> list[str]:
-        name, own = HOVER_PARAMETERS.get(self.autopilot), ONBOARD_HOVER_ESTIMATORS.get(self.autopilot)
-        return [n for n in (name, own[0] if own else None) if n]
 
     def close(self) -> None:
         """Stop listening and close the connection. The requested streams go on."""

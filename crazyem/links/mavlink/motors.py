@@ -7,7 +7,7 @@ Sources: PX4 airframes reference "Quadrotor x" and actuator parameters; ArduPilo
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 OUR_ROTOR_PLACES = (0, 3, 1, 2)  # of our rotors 1..4: index of the autopilot's motor
 SHORTEST_PULSE, LONGEST_PULSE = 1000.0, 2000.0  # us, the usual range of pulses
@@ -39,7 +39,7 @@ class Outputs:
     motors: tuple[int, int, int, int] = OUR_ROTOR_PLACES
     least: tuple[float, ...] = (SHORTEST_PULSE,) * 4
     most: tuple[float, ...] = (LONGEST_PULSE,) * 4
-    assumed: tuple[str, ...] = field(default=())
+    assumed: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, autopilot: int, parameters: Mapping[str, float]) -> "Outputs":

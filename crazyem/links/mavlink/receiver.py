@@ -180,8 +180,7 @@ class Receiver:
             if self.autopilot < 0:
                 return
         if frame.system != self.system:
-            if len(self.foreign) < _MOST_FOREIGN:
-                self.foreign[frame.system] = self.foreign.get(frame.system, 0) + 1
+            self._count_foreign(frame.system)
             return
         if frame.component != self.component:
             return  # a camera or a gimbal has its own sequence numbers
@@ -192,14 +191,17 @@ class Receiver:
             self.on_frame(host_time, frame.raw)
         self._message(sender, frame, host_time)
 
+    def _count_foreign(self, system: int) -> None:
+        if len(self.foreign) < _MOST_FOREIGN:
+            self.foreign[system] = self.foreign.get(system, 0) + 1
+
     def _consider(self, sender: MessageSender, frame: Frame, peer: Peer) -> None:
         """Select the drone if this is a heartbeat of a vehicle (with the wanted number)."""
         fields = frame.fields() if frame.name == "HEARTBEAT" else None
         wanted = self._wanted
         vehicle = fields and fields["autopilot"] != _NO_AUTOPILOT and fields["type"] not in _NOT_A_VEHICLE
         if fields is None or not vehicle or (wanted is not None and frame.system != wanted):
-            if len(self.foreign) < _MOST_FOREIGN:
-                self.foreign[frame.system] = self.foreign.get(frame.system, 0) + 1
+            self._count_foreign(frame.system)
             return
         self.system, self.component = frame.system, frame.component
         self.foreign.pop(frame.system, None)

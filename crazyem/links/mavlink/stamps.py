@@ -10,10 +10,8 @@ from typing import Any
 
 EPOCH_US = 10**15  # us; a larger time_usec is since 1970
 _BEHIND_MS = 2000.0  # ms; stamps further behind the newest one are refused
-_AHEAD_MS, _FASTEST_CLOCK_RATIO = (
-    2000.0,
-    100.0,
-)  # ms; largest lead of a stamp, in addition to this factor times the host's elapsed time
+_AHEAD_MS = 2000.0  # ms; largest lead of a stamp, in addition to the next factor times the host's elapsed time
+_FASTEST_CLOCK_RATIO = 100.0
 _RESTART_REFUSALS = 20  # refused stamps in a row that mean a restart
 _WRAP32 = 1 << 32
 

@@ -27,8 +27,7 @@ SLOW_HZ = 10.0
 # The older request: MAV_DATA_STREAM raw sensors, extended status, RC channels (servos), position, extra 1, extra 2.
 STREAM_GROUPS = ((1, True), (2, False), (3, True), (6, True), (10, True), (11, True))
 
-_BLOCK_TYPES = {"outputs": "float", "rotors": "float", "battery": "uint32_t"}
-_INTEGER_TYPES = {"SCALED_IMU": "int16_t", "RAW_IMU": "int16_t"}
+_INTEGER_TYPES = {"battery": "uint32_t", "SCALED_IMU": "int16_t", "RAW_IMU": "int16_t"}
 # Of several messages with the same content, only one is used: the first in this order that arrives.
 ALTERNATIVE_MESSAGES: tuple[tuple[str, ...], ...] = (
     ("ATTITUDE_QUATERNION", "ATTITUDE"),
@@ -49,7 +48,7 @@ def variables_of(name: str) -> tuple[Variable, ...]:
     """Variables of a block: each field once, in the order of the table."""
     if name == INFO:
         return (Variable(f"{INFO}.info", "uint16_t"),)
-    ctype = _BLOCK_TYPES.get(name) or _INTEGER_TYPES.get(name, "float")
+    ctype = _INTEGER_TYPES.get(name, "float")
     found = dict.fromkeys(v for m in MAPPINGS if m.message == name for v in m.variables)
     return tuple(Variable(v, ctype) for v in found)
 
@@ -62,13 +61,11 @@ class Streams:
 
     Attributes:
         cells: number of battery cells, 0 if unknown.
-        info: state of the autopilot in the supervisor's bits; None before its first heartbeat.
     """
 
     def __init__(self, outputs: Outputs | None = None) -> None:
         self.outputs = outputs or Outputs()
         self.cells = 0
-        self.info: int | None = None
         self._landed: int | None = None
         self._beat: tuple[int, int] = (0, 0)  # base mode, state
         self._taken: set[str] | None = None
@@ -175,7 +172,6 @@ class Streams:
         ill = state in (_EMERGENCY, _POWEROFF, _TERMINATION)
         info = armed * ARMED | flying * FLYING | ill * CRASHED
         info |= (state in (_STANDBY, _ACTIVE, _CRITICAL)) * (CAN_ARM | CAN_FLY)
-        self.info = info
         return INFO, (float(info),)
 
 
