@@ -8,8 +8,8 @@ from pathlib import Path
 
 from firmware_sim.errors import FirmwareSimError
 from firmware_sim.firmware import boot
-from firmware_sim.server import Server, bind
-from firmware_sim.start import open_truth, stop_on_signals
+from firmware_sim.server import Server
+from firmware_sim.start import bind, open_truth, stop_on_signals
 from firmware_sim.wire import Air
 
 

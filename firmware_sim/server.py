@@ -14,12 +14,14 @@ from typing import TYPE_CHECKING, TextIO
 from firmware_sim import wire
 from firmware_sim.errors import ServerError
 from firmware_sim.firmware import Firmware
+from firmware_sim.start import bind
 from firmware_sim.wire import Air
 
 if TYPE_CHECKING:
     from firmware_sim.flight import Flight
 
-_BUFFER = 1 << 20  # bytes, both ways: a client reads its whole table of contents in bursts
+__all__ = ["Server", "TruthWriter", "bind"]
+
 # Largest delay of the drone's time behind the host's that is caught up after a stall; a longer delay is skipped. Below
 # the 500 ms after which the setpoint watchdog regards a client as dead.
 _MAX_BEHIND_HOST, _MAX_BEHIND_FIRMWARE = 250.0, 300.0  # ms of host time, ms of firmware time
@@ -27,21 +29,6 @@ _CHUNK_MS = 20  # ms of firmware time between two looks at the socket
 _TRUTH_PERIOD = 10  # ms between rows of the truth file
 
 Address = tuple[str, int]
-
-
-def bind(host: str, port: int) -> socket.socket:
-    """A bound, non-blocking UDP socket; port 0 picks a free one. Raises ServerError in one sentence."""
-    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
-        sock.setsockopt(socket.SOL_SOCKET, option, _BUFFER)
-    try:
-        sock.bind((host, port))
-    except (OSError, OverflowError) as error:
-        sock.close()
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise ServerError(f"cannot listen on udp://{host}:{port}: {reason}") from None
-    sock.setblocking(False)
-    return sock
 
 
 class TruthWriter:

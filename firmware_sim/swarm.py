@@ -25,7 +25,8 @@ from typing import TYPE_CHECKING, Any
 
 from firmware_sim.errors import ScenarioError
 from firmware_sim.firmware import Firmware, boot
-from firmware_sim.server import Server, bind
+from firmware_sim.server import Server
+from firmware_sim.start import bind
 from firmware_sim.vehicle_file import read_toml
 from firmware_sim.wire import Air
 

@@ -144,7 +144,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     end = float("inf") if arguments.duration is None else time.monotonic() + arguments.duration
     try:
         relay.run(lambda: time.monotonic() >= end)
-    except RelayError as error:  # another program took the port while it was closed
+    except FirmwareSimError as error:  # another program took the port while it was closed
         print(f"relay: {error}", file=sys.stderr)
         return 2
     print(json.dumps(account(engine), indent=2) if arguments.json else _text(engine), flush=True)

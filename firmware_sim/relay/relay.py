@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 from firmware_sim.relay.faults import DOWN, UP, Engine
 from firmware_sim.relay.kinds import RelayError
+from firmware_sim.start import bind, udp_socket
 
 Address = tuple[str, int]
 MOST_HOSTS = 64  # beyond, the longest silent host is removed: every scan counts as a new host
-_BUFFER = 1 << 20  # bytes
 _LONGEST_NAP = 0.05  # s between two looks at the schedule
 
 
@@ -34,7 +34,7 @@ class Relay:
         engine: applies the faults.
         host, port: where to listen; port 0 picks a free one.
 
-    Raises: RelayError: the port cannot be listened on.
+    Raises: ServerError: the port cannot be listened on.
     """
 
     def __init__(self, target: Address, engine: Engine, *, host: str = "127.0.0.1", port: int = 0) -> None:
@@ -81,17 +81,9 @@ class Relay:
 
     def _open(self) -> None:
         self._give_place()
-        sock = _socket()
-        try:
-            sock.bind(self.address)
-        except (OSError, OverflowError) as error:
-            sock.close()
-            host, port = self.address
-            reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-            raise RelayError(f"cannot listen on udp://{host}:{port}: {reason}") from None
-        self.address = sock.getsockname()
-        self._listener = sock
-        self._selector.register(sock, selectors.EVENT_READ, None)
+        self._listener = bind(*self.address)
+        self.address = self._listener.getsockname()
+        self._selector.register(self._listener, selectors.EVENT_READ, None)
 
     def _close_listener(self) -> None:
         if self._listener is not None:
@@ -105,7 +97,7 @@ class Relay:
         A connected UDP socket receives from its peer only. Connected to itself, the socket receives nothing.
         """
         self._close_listener()
-        self._place = _socket()
+        self._place = udp_socket()
         self._place.bind(self.address)
         self._place.connect(self.address)
 
@@ -136,7 +128,7 @@ class Relay:
             return
         if len(self._drones) >= MOST_HOSTS:
             self._forget(min(self._drones, key=self._heard.__getitem__))
-        sock = _socket()
+        sock = udp_socket()
         sock.connect(self.target)
         self._drones[host] = sock
         self._selector.register(sock, selectors.EVENT_READ, host)
@@ -159,11 +151,3 @@ class Relay:
                     drone.send(datagram)
                 elif self._listener is not None:
                     self._listener.sendto(datagram, route)
-
-
-def _socket() -> socket.socket:
-    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
-        sock.setsockopt(socket.SOL_SOCKET, option, _BUFFER)
-    sock.setblocking(False)
-    return sock

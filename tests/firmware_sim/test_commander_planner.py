@@ -1,10 +1,7 @@
-"""The planner of high-level commands, against closed forms and a recorded take-off."""
+"""The planner of high-level commands, against closed forms."""
 
-import csv
-import gzip
 import math
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,12 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.polynomial import polynomial as npoly
 
-from firmware_sim import wire
 from firmware_sim.commander import polynomials as poly
 from firmware_sim.commander.planner import Planner, PlannerState
-from firmware_sim.firmware import Firmware
-from firmware_sim.flight import Flight
-from firmware_sim.scenario import load_scenario
 
 small = st.floats(-3.0, 3.0)
 durations = st.floats(0.5, 8.0)
@@ -203,47 +196,3 @@ def test_compressed_trajectories_decode_what_cflib_encodes():
     assert poly.evaluate(piece, 2.0 * s).position[1] == pytest.approx(control[0], abs=1e-9)
     with pytest.raises(ValueError, match="past"):
         poly.unpack_compressed(memory[:-2], 0)
-
-
-# a take-off of the whole simulator against the same take-off recorded from the real firmware (with another pl
-
-
-RECORDING = (
-    Path(__file__).parents[3] / "shared" / "recordings" / "real_firmware" / "lee_34g_mass_pushed_midflight.csv.gz"
-)
-ACTIVE = 0x100  # the bit of supervisor.info that says the high-level commander is flying
-
-
-@pytest.mark.skipif(not RECORDING.exists(), reason="the recording of the real firmware is not at hand")
-def test_takeoff_follows_the_real_firmware(tmp_path):
-    with gzip.open(RECORDING, "rt") as file:
-        rows = list(csv.DictReader(file))
-
-    def signal(name):
-        return np.array([(int(r["fw_ms"]), float(r["value"])) for r in rows if r["name"] == name]).T
-
-    ticks, height = signal("stateEstimateZ.z")
-    thrust_ticks, thrust = signal("ctrlLee.thrustSi")
-    info_ticks, info = signal("supervisor.info")
-    command = info_ticks[np.flatnonzero(info.astype(int) & ACTIVE)[0]] - 30  # updated at 25 Hz
-
-    path = tmp_path / "scenario.toml"
-    path.write_text("[vehicle]\nmass = 0.034\nmotor_time_constant = 0.03\n")
-    scenario = load_scenario(path)
-    believed = {"stabilizer.controller": 5.0, "ctrlLee.mass": 0.029}
-    firmware = Firmware(Flight(scenario, 1), platform="cf2", seed=1, parameters=believed)
-    firmware.advance(1000)
-    takeoff = struct.pack("<BBff?f", 7, 0, 1.0, 0.0, True, 2.5)
-    firmware.receive(wire.Packet(wire.SETPOINT_HIGH_LEVEL, 0, takeoff))
-    times, flown, forces = np.arange(10, 3800, 10), [], []
-    for _ in times:
-        firmware.advance(10)
-        flown.append(firmware.log.table.by_name["stateEstimate.z"].value)
-        forces.append(firmware.log.table.by_name["ctrlLee.thrustSi"].value)
-
-    real = np.interp(command + times, ticks, height / 1000.0)
-    assert real.max() > 0.7
-    np.testing.assert_allclose(flown, real, atol=0.03)  # m; the two estimates are that noisy
-    settled = times > 3000
-    hover = np.interp(command + times, thrust_ticks, thrust)[settled].mean()
-    assert np.mean(np.array(forces)[settled]) == pytest.approx(hover, rel=0.01)

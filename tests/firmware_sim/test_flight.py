@@ -204,6 +204,7 @@ def test_tables_are_live_and_consistent() -> None:
     assert read(flight, "stateEstimateZ.ratePitch") == pytest.approx(-1000 * np.radians(gyro_y), abs=1)
     assert read(flight, "ctrlLee.omegay") == pytest.approx(np.radians(gyro_y), abs=0.05)
     assert read(flight, "stabilizer.thrust") == read(flight, "ctrlLee.torquey")  # the firmware's union
+    assert read(flight, "controller.cmd_thrust") == read(flight, "controller.cmd_roll") == 0.0  # of the PID
     assert read(flight, "pm.vbatMV") == int(1000 * read(flight, "pm.vbat"))
     assert 0.9 < read(flight, "acc.z") < 1.1
     assert read(flight, "ctrlLee.thrustSi") == pytest.approx(0.036 * 9.81, rel=0.1)

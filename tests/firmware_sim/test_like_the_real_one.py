@@ -137,13 +137,6 @@ def stays_locked(drone):
 # Section 4: setpoints
 
 
-def test_the_high_level_commander_holds_a_hover_without_any_packet():
-    drone = hovering()
-    drone.run(10.0)
-    assert drone.height == pytest.approx(1.0, abs=0.03)
-    assert drone.info & (FLYING | HL_ACTIVE | HL_FINISHED) == FLYING | HL_ACTIVE | HL_FINISHED
-
-
 @pytest.mark.parametrize("controller", [PID, MELLINGER, INDI, LEE])
 def test_a_setpoint_of_500_ms_levels_out_and_one_of_2000_ms_locks_until_reboot(controller):
     drone = Drone(stabilizer__controller=controller)
@@ -322,16 +315,6 @@ def test_an_armed_drone_that_does_not_fly_disarms_after_30_s_and_a_landed_one_af
 
 
 # Sections 9 and 10: variables and parameters
-
-
-def test_under_lee_stabilizer_thrust_is_torque_y_and_the_pid_shows_zeros():
-    """[M]."""
-    drone = Drone(stabilizer__controller=LEE)
-    seen = drone.watch(3.0, ["stabilizer.thrust", "ctrlLee.torquey", "controller.cmd_thrust", "controller.cmd_roll"],
-                       lambda t: full_state((0.2 * t, 0, min(1.0, t))))  # fmt: skip
-    assert np.array_equal(seen[:, 0], seen[:, 1])
-    assert np.ptp(seen[:, 0]) > 1e-5
-    assert not seen[:, 2:].any()
 
 
 def test_a_mass_15_percent_low_hangs_0_24_m_low():

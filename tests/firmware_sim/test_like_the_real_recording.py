@@ -183,6 +183,14 @@ def test_the_drone_follows_the_figure_without_a_lag_as_the_real_one_does(both):
         assert abs(best_lag(ms[inside], signal[inside], recording.sent, reference)) < 0.05
 
 
+def test_take_off_is_the_recorded_one(brushed):
+    recording, ms, flown = brushed
+    inside = (ms > recording.commands()[0]) & (ms < recording.sent[0])
+    real = recording.at("stateEstimateZ.z", ms)[inside]
+    assert real.max() > 700.0
+    assert flown["stateEstimateZ.z"][inside] == pytest.approx(real, abs=30.0)  # mm; the estimates are that noisy
+
+
 def test_hover_before_the_figure_is_the_recorded_one(both):
     """Hanging low by the believed mass, force and motor command (at the recorded voltage)."""
     recording, ms, flown = both
