@@ -12,6 +12,7 @@ and inertia comes from the inverse of the whole matrix.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,8 @@ from crazyem.compiled import compiled
 from crazyem.errors import UsageError
 from crazyem.paper.flight import Flight
 from crazyem.paper.plant import derivative, thrust_axis
+from crazyem.paper.published_values import PARAMETERS
 
-PARAMETERS = ("mass", "Ixx", "Iyy", "Izz")
 PROCESS_NOISES = ("force", "torque_x", "torque_y", "torque_z")
 SENSORS = ("position", "velocity", "attitude", "body_rate", "specific_force")
 MEASURED = {
@@ -29,7 +30,6 @@ MEASURED = {
     "B": ("position", "velocity", "attitude", "body_rate"),
     "C": ("position", "velocity", "body_rate"),
 }
-NOISE_CASES = ("free", "common", "single", "known")
 # m, m/s, rad, rad/s around the true state at the start. Wide enough to add little information to half a second of data
 # (a wider start raises the bound of mass by 0.5 % at most), narrow enough that the filter is linear. From 0.3 rad of
 # attitude on, the start biases the score of mass by 0.3 of the bound (sensor A).
@@ -217,31 +217,16 @@ class Bound:
         """
         return (self.covariance @ self.score)[:4]
 
-    def under(self, noise: str, *, sensors: str = "free") -> "Bound":
-        """The bound with more knowledge of the noise, computed from a bound with all noise scales free.
+    def under(self, noise: Literal["single", "known"]) -> "Bound":
+        """The bound with more knowledge of the process noise, from a bound with all noise scales free.
 
         Args:
-            noise: free, common (one intensity for the three torques), single (one factor for thrust and torques: their
-                ratio is known) or known.
-            sensors: free or known: standard deviations of the measurements.
-
-        Raises: UsageError: no such option, or this bound does not contain these noise scales.
+            noise: single (one factor for thrust and torques: their ratio is known) or known.
         """
-        if noise not in NOISE_CASES:
-            raise UsageError(f"unknown noise '{noise}' (known: {', '.join(NOISE_CASES)})")
-        if sensors not in {"free", "known"}:
-            raise UsageError(f"sensors are free or known, not '{sensors}'")
-        if any(name not in self.names for name in PROCESS_NOISES):
-            raise UsageError("this bound has no free noise scales to tie together")
         groups: list[tuple[str, tuple[str, ...]]] = [(name, (name,)) for name in PARAMETERS]
-        if noise == "free":
-            groups += [(name, (name,)) for name in PROCESS_NOISES]
-        elif noise == "common":
-            groups += [("force", ("force",)), ("torque", PROCESS_NOISES[1:])]
-        elif noise == "single":
+        if noise == "single":
             groups += [("noise", PROCESS_NOISES)]
-        if sensors == "free":
-            groups += [(name, (name,)) for name in self.names if name in SENSORS]
+        groups += [(name, (name,)) for name in self.names if name in SENSORS]
         tie = np.array([[float(name in members) for name in self.names] for _, members in groups])
         return Bound(tuple(name for name, _ in groups), tie @ self.information @ tie.T, tie @ self.score)
 
@@ -265,14 +250,14 @@ def observed(flight: Flight, sensor: str, first: int, last: int, *, acceleromete
     return y
 
 
-def _add(seen: NDArray, e: NDArray, cov: NDArray, step: float, information: NDArray, score: NDArray) -> None:
+def _add(seen: NDArray, e: NDArray, cov: NDArray, information: NDArray, score: NDArray) -> None:
     """Add the contributions of some rows to the information (p, p) and the score (p,), in place.
 
     Args:
         seen: (m,) measured columns.
         e, cov: (2 p + 1, n, 15), (2 p + 1, n, 15, 15) at the truth, then a step up and a step down for each parameter.
-        step: in the logarithms.
     """
+    step = DERIVATIVE_STEP
     e, cov = e[:, :, seen], cov[:, :, seen[:, None], seen]
     white = np.linalg.inv(np.linalg.cholesky(cov[0]))  # whitening matrix: the sums become plain products
     error = (white @ e[0, ..., None])[..., 0]
@@ -284,26 +269,16 @@ def _add(seen: NDArray, e: NDArray, cov: NDArray, step: float, information: NDAr
     score -= flat_slope @ error.ravel() + 0.5 * flat_spread @ size.ravel()
 
 
-def bound(
-    flight: Flight,
-    sensor: str,
-    first: int = 0,
-    last: int | None = None,
-    *,
-    noise: str = "free",
-    sensors: str = "free",
-    accelerometer: bool = True,
-) -> Bound:
+def bound(flight: Flight, sensor: str, first: int = 0, last: int | None = None, *, accelerometer: bool = True) -> Bound:
     """Cramer-Rao bound of mass and inertia from rows first..last-1 of a flight.
 
     Args:
         flight: any; its true state is only the centre of the start, its true parameters are used throughout.
         sensor: A, B or C.
         first, last: rows; last defaults to all rows flown.
-        noise, sensors: knowledge of the noise, see `Bound.under`.
         accelerometer: whether sensor A also measures the specific force.
 
-    Raises: UsageError: no such sensor, rows or option.
+    Raises: UsageError: no such sensor or rows.
     """
     last = flight.size if last is None else last
     y = observed(flight, sensor, first, last, accelerometer=accelerometer)
@@ -327,8 +302,5 @@ def bound(
         e, cov = np.empty((len(runs), n, 15)), np.empty((len(runs), n, 15, 15))
         for i, (v, x, p) in enumerate(runs):
             innovations(begin, end, y, wrench, x, p, s.dt, v[0], v[1:4], v[4:8], v[8:13], e[i], cov[i])
-        _add(seen, e, cov, DERIVATIVE_STEP, information, score)
-    whole = Bound(tuple(names[i] for i in free), information, score)
-    if (noise, sensors) == ("free", "free"):
-        return whole
-    return whole.under(noise, sensors=sensors)
+        _add(seen, e, cov, information, score)
+    return Bound(tuple(names[i] for i in free), information, score)

@@ -128,20 +128,19 @@ def _table1(task: Task, settings: Settings) -> dict[str, Any]:
 
 def _offline_published(task: Task, settings: Settings) -> dict[str, Any]:
     flight = fly(settings, task.seed)
-    theta = published_offline(flight, task.sensor, iterations=OFFLINE_ITERATIONS).theta
+    theta = published_offline(flight, task.sensor, iterations=OFFLINE_ITERATIONS)
     record: dict[str, Any] = {"theta": short(theta), "final": short(theta[-1])}
     if task.sensor == "C":
-        theta = published_offline(flight, "C", angles="dead-reckoned", iterations=OFFLINE_ITERATIONS).theta
+        theta = published_offline(flight, "C", angles="dead-reckoned", iterations=OFFLINE_ITERATIONS)
         record["dead_reckoned"] = short(theta[-1])
     return record
 
 
 def _offline_crazyem(task: Task, settings: Settings) -> dict[str, Any]:
     fit = product_offline(fly(settings, task.seed), task.sensor)
-    history = getattr(fit, "history", None)
     return {
         "final": short(fit.value), "sd": short(fit.sd), "ci95": short(fit.ci95), "converged": bool(fit.converged),
-        "theta": None if history is None or not len(history) else short(np.asarray(history)[:, :4]),
+        "theta": short(fit.history),
     }  # fmt: skip
 
 

@@ -134,8 +134,11 @@ def _path(
 # convergence --------------------------------------------------------------------------------------------------
 
 
-def _panels(figure: Any, wanted: PaperFigure, settings: Settings, label: str) -> tuple[Any, Any, int, float]:
-    """Two axes, whole and enlarged, with the truth in red and the paper's range; also the column and its scale."""
+Marks = tuple[float, float, float]  # ends of the paper's range, truth
+
+
+def _panels(figure: Any, wanted: PaperFigure, settings: Settings, label: str) -> tuple[Any, Any, int, float, Marks]:
+    """Two axes, whole and enlarged, with the truth in red and the paper's range; also column, scale and marks."""
     column = PARAMETERS.index(wanted.parameter)
     scale = 1.0 if wanted.parameter == "mass" else 1e4
     truth = scale * (settings.mass, *settings.inertia)[column]
@@ -148,12 +151,13 @@ def _panels(figure: Any, wanted: PaperFigure, settings: Settings, label: str) ->
     whole.set_ylim(0, 2 * truth)
     near.set_xlabel(label)
     figure.subplots_adjust(left=0.12, right=0.98, top=0.93, bottom=0.09, hspace=0.1)
-    return whole, near, column, scale
+    return whole, near, column, scale, (low, high, truth)
 
 
-def _enlarge(axis: Any, settled: Sequence[float], shown: tuple[float, float], truth: float) -> None:
-    """Limits that hold the settled values and the paper's range."""
-    values = [v for v in (*settled, *shown, truth) if np.isfinite(v)]
+def _enlarge(axis: Any, settled: Sequence[float], marks: Marks) -> None:
+    """Limits that hold the settled values, the paper's range and the truth."""
+    truth = marks[2]
+    values = [v for v in (*settled, *marks) if np.isfinite(v)]
     low, high = max(min(values), 0.5 * truth), min(max(values), 2 * truth)
     margin = 0.15 * (high - low) or 0.01 * truth
     axis.set_ylim(low - margin, high + margin)
@@ -174,7 +178,7 @@ def _column(rows: Any, column: int, scale: float) -> NDArray:
 
 
 def _offline(figure: Any, wanted: PaperFigure, settings: Settings, runs: Mapping[str, Sequence[Record]]) -> str:
-    whole, near, column, scale = _panels(figure, wanted, settings, "EM iteration")
+    whole, near, column, scale, marks = _panels(figure, wanted, settings, "EM iteration")
     published = [_column(r["theta"], column, scale) for r in runs["published"]]
     settled = [c[-1] for c in published]
     last = max((len(c) - 1 for c in published), default=20)
@@ -188,16 +192,14 @@ def _offline(figure: Any, wanted: PaperFigure, settings: Settings, runs: Mapping
         _lines(axis, np.arange(max(map(len, histories), default=0)), histories, _CRAZYEM, "crazyem")
         axis.vlines(at, limits[:, 0], limits[:, 1], "C0", linewidth=1, label="crazyem, 95 % intervals")
         axis.plot(at, finals, "C0.", markersize=3)
-    truth = scale * (settings.mass, *settings.inertia)[column]
-    paper = PUBLISHED_RANGES["offline", wanted.sensor][wanted.parameter]
-    _enlarge(near, settled, (scale * paper[0], scale * paper[1]), truth)
+    _enlarge(near, settled, marks)
     whole.legend(loc="upper right")
     return "Below, enlarged. crazyem's estimates with their 95 % intervals stand at the right, one for each flight."
 
 
 def _online(figure: Any, wanted: PaperFigure, settings: Settings, runs: Mapping[str, Sequence[Record]]) -> str:
     label = f"update (every {settings.every} steps of {1e3 * settings.dt:g} ms)"
-    whole, near, column, scale = _panels(figure, wanted, settings, label)
+    whole, near, column, scale, marks = _panels(figure, wanted, settings, label)
     settled: list[float] = []
     for method, style in (("published", _PUBLISHED), ("crazyem", _CRAZYEM)):
         curves = [_column(r["theta"], column, scale) for r in runs[method]]
@@ -212,9 +214,7 @@ def _online(figure: Any, wanted: PaperFigure, settings: Settings, runs: Mapping[
         rows, ci95 = _band(record, column, scale)
         for axis in (whole, near):
             axis.fill_between(rows, ci95[:, 0], ci95[:, 1], color="C0", alpha=0.2, linewidth=0, label="95 % interval")
-    truth = scale * (settings.mass, *settings.inertia)[column]
-    paper = PUBLISHED_RANGES["online", wanted.sensor][wanted.parameter]
-    _enlarge(near, settled, (scale * paper[0], scale * paper[1]), truth)
+    _enlarge(near, settled, marks)
     whole.legend(loc="upper right")
     return "Below, enlarged; the first updates are outside. The band is crazyem's 95 % interval in the first flight."
 

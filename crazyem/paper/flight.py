@@ -16,6 +16,7 @@ from crazyem.control.trajectories import smooth_step
 from crazyem.errors import UsageError
 from crazyem.paper.plant import filter_step, step, thrust_axis
 from crazyem.paper.settings import Settings
+from crazyem.physics.rotations import quaternion_from_euler
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import GRAVITY
 
@@ -206,23 +207,12 @@ class Flight:
             if sensor in "BC":
                 yield Sample("velocity", t, tuple(row[3:6]))
             if sensor == "B":
-                yield Sample("attitude", t, _quaternion(*row[6:9]))
+                yield Sample("attitude", t, tuple(quaternion_from_euler(*row[6:9]).tolist()))
             yield Sample("body_rate", t, tuple(row[9:12]))
             if sensor == "A" and k:
                 yield Sample("specific_force", t, tuple(row[15:18]))
             if k + 1 < self.size:  # the wrench of the newest row is not known yet
                 yield Sample("wrench_command", t, tuple(self.wrench[k].tolist()))
-
-
-def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """x y z w of Rz(yaw) Ry(pitch) Rx(roll)."""
-    (sr, sp, sy), (cr, cp, cy) = np.sin([roll / 2, pitch / 2, yaw / 2]), np.cos([roll / 2, pitch / 2, yaw / 2])
-    return (
-        float(sr * cp * cy - cr * sp * sy),
-        float(cr * sp * cy + sr * cp * sy),
-        float(cr * cp * sy - sr * sp * cy),
-        float(cr * cp * cy + sr * sp * sy),
-    )
 
 
 def reference(settings: Settings) -> NDArray:

@@ -16,11 +16,11 @@ from crazyem.estimation.model import KnownNoise
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.estimation.result import Estimate
 from crazyem.paper.flight import Flight
+from crazyem.paper.published_values import PARAMETERS
 from crazyem.paper.settings import Settings
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import load_vehicle
 
-PARAMETERS = ("mass", "Ixx", "Iyy", "Izz")
 NO_UPDATE = 10**9  # samples between updates when only the last one is wanted
 
 
@@ -33,9 +33,8 @@ class Fit:
         sd: (4,) standard deviations, same units.
         ci95: (4, 2) 95 % intervals.
         converged: whether the score test was passed.
-        passes: number of full passes; 0 if the estimator does not store them.
-        history: (passes + 1, 4) value before each pass and at the end; empty if the estimator does not store it.
-        noise: scales by name, as `Estimate.noise`.
+        passes: number of full passes.
+        history: (passes + 1, 4) value before each pass and at the end.
         seconds: wall-clock time without handing over the samples.
     """
 
@@ -45,7 +44,6 @@ class Fit:
     converged: bool
     passes: int
     history: NDArray
-    noise: dict[str, float]
     seconds: float
 
 
@@ -55,23 +53,13 @@ def known_noise(settings: Settings) -> KnownNoise:
 
 
 def estimator_for(
-    settings: Settings,
-    sensor: str,
-    *,
-    window: int | None = None,
-    every: int | None = None,
-    mass: float | None = None,
-    inertia: tuple[float, float, float] | None = None,
-    known: KnownNoise | None = None,
-    accelerometer: bool = True,
+    settings: Settings, sensor: str, *, known: KnownNoise | None = None, accelerometer: bool = True
 ) -> OnlineEstimator:
     """A new estimator for flights with these settings.
 
     Args:
         settings: only window, update interval, start values and the way of stepping are used.
         sensor: A, B or C; A has an accelerometer.
-        window, every: samples, where they differ from the settings.
-        mass, inertia: kg, (3,) kg m^2 to start from, where they differ from the settings.
         known: noise that the estimator knows.
         accelerometer: whether to use the accelerometer of sensor A.
 
@@ -79,13 +67,12 @@ def estimator_for(
     """
     if sensor not in {"A", "B", "C"}:
         raise UsageError(f"unknown sensor '{sensor}' (known: A, B, C)")
-    mass = settings.mass_start if mass is None else mass
-    inertia = settings.inertia_start if inertia is None else inertia
+    mass, inertia = settings.mass_start, settings.inertia_start
     vehicle = replace(load_vehicle("zhao"), mass=mass, inertia=inertia)  # replaces the true values of the preset
     return OnlineEstimator(
         vehicle,
-        window=settings.window if window is None else window,
-        every=settings.every if every is None else every,
+        window=settings.window,
+        every=settings.every,
         input_signal="wrench_command",
         mass=mass,
         inertia=inertia,
@@ -110,34 +97,35 @@ def product_offline(
 
     Args:
         flight: only its samples and settings are used.
-        sensor, mass, inertia, known, accelerometer: as for `estimator_for`.
+        sensor, known, accelerometer: as for `estimator_for`.
         first, last: rows; last defaults to all rows flown.
+        mass, inertia: kg, (3,) kg m^2 to start from, where they differ from the settings.
 
     Raises: UsageError: no such sensor, or too few rows.
     """
     last = flight.size if last is None else last
     if not 0 <= first < last <= flight.size:
         raise UsageError(f"rows {first} to {last} are not in a flight of {flight.size} rows")
-    estimator = estimator_for(
-        flight.settings, sensor, window=last - first, every=NO_UPDATE, mass=mass, inertia=inertia, known=known,
-        accelerometer=accelerometer,
-    )  # fmt: skip
+    settings = replace(flight.settings, window=last - first, every=NO_UPDATE)
+    if mass is not None:
+        settings = replace(settings, mass_start=mass)
+    if inertia is not None:
+        settings = replace(settings, inertia_start=inertia)
+    estimator = estimator_for(settings, sensor, known=known, accelerometer=accelerometer)
     for sample in flight.samples(sensor, first, last):
         estimator.feed(sample)
     begin = time.perf_counter()
     estimate = estimator.finish()
     seconds = time.perf_counter() - begin
-    # parameters before each full pass of the last convergence, and at its end, if the estimator stores them
-    trace = np.array([theta[:4] for theta in getattr(estimator, "trace", ())]).reshape(-1, 4)
+    trace = np.array([theta[:4] for theta in estimator.trace])
     said = [estimate[name] for name in PARAMETERS]
     return Fit(
         value=np.array([p.value for p in said]),
         sd=np.array([p.sd for p in said]),
         ci95=np.array([p.ci95 for p in said]),
         converged=estimate.converged,
-        passes=max(len(trace) - 1, 0),
+        passes=len(trace) - 1,
         history=trace,
-        noise=dict(estimate.noise),
         seconds=seconds,
     )
 

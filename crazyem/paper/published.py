@@ -9,7 +9,6 @@ Jacobian of eq. 59, the covariance couples neither position and velocity with an
 and is equal for these axes. Three numbers and a 6 by 6 block therefore represent it.
 """
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -19,7 +18,6 @@ from crazyem.compiled import compiled
 from crazyem.errors import UsageError
 from crazyem.paper.flight import Flight
 from crazyem.paper.plant import derivative, transition
-from crazyem.paper.published_values import CORRECTIONS, Correction
 from crazyem.paper.settings import Settings
 from crazyem.vehicle import GRAVITY
 
@@ -230,23 +228,10 @@ def maximisation(x, wrench, theta, dt, clamp, lowest, highest, new):
         new[i] = value
 
 
-__all__ = ["CORRECTIONS", "Correction", "PublishedFit", "PublishedOnline", "published_offline"]
-
 # `clamp` refuses an inertia that differs from I0 by a larger factor: with a factor of ten the rate loop is still stable
 LARGEST_INERTIA_RATIO = 10.0
 
 Angles = Literal["zero", "dead-reckoned"]
-
-
-@dataclass(frozen=True)
-class PublishedFit:
-    """The result of the EM iterations on one flight.
-
-    Attributes:
-        theta: (n_iterations + 1, 4) mass kg, Ixx, Iyy, Izz kg m^2 after each EM iteration, the start first.
-    """
-
-    theta: NDArray
 
 
 class _Workspace:
@@ -288,14 +273,12 @@ def _observed(flight: Flight, sensor: str, first: int) -> NDArray:
     return rows
 
 
-def _check(sensor: str, angles: str) -> None:
+def _check(sensor: str) -> None:
     if sensor not in ("A", "B", "C"):
         raise UsageError(f"there is no sensor {sensor!r} in the paper: A, B or C")
-    if angles not in ("zero", "dead-reckoned"):
-        raise UsageError(f'angles that sensor C lacks are "zero" or "dead-reckoned", not {angles!r}')
 
 
-def published_offline(flight: Flight, sensor: str, *, angles: Angles = "zero", iterations: int = 20) -> PublishedFit:
+def published_offline(flight: Flight, sensor: str, *, angles: Angles = "zero", iterations: int = 20) -> NDArray:
     """EM over all rows of a flight, from m0 and I0 (eq. 116, 117).
 
     Args:
@@ -305,9 +288,11 @@ def published_offline(flight: Flight, sensor: str, *, angles: Angles = "zero", i
             from the start (their rows dropped from H).
         iterations: number of EM iterations.
 
-    Raises: UsageError: no such sensor or treatment of the angles; fewer than two rows.
+    Returns: (iterations + 1, 4) mass kg, Ixx, Iyy, Izz kg m^2 after each EM iteration, the start first.
+
+    Raises: UsageError: no such sensor; fewer than two rows.
     """
-    _check(sensor, angles)
+    _check(sensor)
     if flight.size < 2:
         raise UsageError("the flight has not been flown yet: EM needs two rows at least")
     s = flight.settings
@@ -323,7 +308,7 @@ def published_offline(flight: Flight, sensor: str, *, angles: Angles = "zero", i
         theta[i + 1] = work.iterate(
             observed, flight.wrench[: flight.size], first, theta[i], sees_angles=sees, clamp=False
         )
-    return PublishedFit(theta)
+    return theta
 
 
 class PublishedOnline:
@@ -334,8 +319,7 @@ class PublishedOnline:
 
     Args:
         settings: of the flight.
-        sensor, angles: as in `published_offline`. Dead-reckoned angles start from the last window's filtered angles at
-            the row that is now the first (smoothed angles would drift, because the smoother ignores Phi).
+        sensor: A, B or C, whose missing angles are observed as zero.
         clamp: whether to refuse a mass that is not positive, or an inertia that differs from I0 by a factor over
             `LARGEST_INERTIA_RATIO`, and keep the last one. As printed: False; some flights from m0 = 1 g then crash.
 
@@ -343,26 +327,20 @@ class PublishedOnline:
         theta: (4,) mass kg, Ixx, Iyy, Izz kg m^2, newest.
     """
 
-    def __init__(self, settings: Settings, sensor: str, *, angles: Angles = "zero", clamp: bool = False) -> None:
-        _check(sensor, angles)
+    def __init__(self, settings: Settings, sensor: str, *, clamp: bool = False) -> None:
+        _check(sensor)
         self.sensor = sensor
-        self.angles = angles
         self.clamp = clamp
         self.theta = np.array([settings.mass_start, *settings.inertia_start])
         self._work = _Workspace(settings.window, settings)
-        self._first = 0  # row of the flight at which the last window began
-        self._begun = False
 
     def update(self, flight: Flight) -> tuple[float, NDArray]:
         """Mass kg and inertia (3,) kg m^2 after one more iteration over the newest rows of the flight."""
         first = max(0, flight.size - self._work.settings.window)
         if flight.size - first >= 2:
             observed = np.ascontiguousarray(_observed(flight, self.sensor, first))
-            start = observed[0].copy()
-            sees = self.sensor != "C" or self.angles == "zero"
-            if not sees:
-                start[6:9] = self._work.filtered[first - self._first, 6:9] if self._begun else flight.estimate[0, 6:9]
             wrench = flight.wrench[first : flight.size]
-            self.theta = self._work.iterate(observed, wrench, start, self.theta, sees_angles=sees, clamp=self.clamp)
-            self._first, self._begun = first, True
+            self.theta = self._work.iterate(
+                observed, wrench, observed[0].copy(), self.theta, sees_angles=True, clamp=self.clamp
+            )
         return float(self.theta[0]), self.theta[1:].copy()

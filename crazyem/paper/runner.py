@@ -23,23 +23,19 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 # Files on which the numbers of a task depend. Tables and figures are made anew in each run.
 _CODE = ("physics/**/*.py", "signals/**/*.py", "control/**/*.py", "estimation/**/*.py", "presets/zhao.toml",
          "vehicle.py", "compiled.py", "paper/*.py")  # fmt: skip
-_TEXT_MODULES = "runner tables table_text figures pages published_values"
-_NOT_CODE = {f"paper/{name}.py" for name in _TEXT_MODULES.split()}
+_TEXT_MODULES = ("runner", "tables", "table_text", "figures", "pages", "published_values")
+_NOT_CODE = {f"paper/{name}.py" for name in _TEXT_MODULES}
 _VERSIONED_PACKAGES = ("numpy", "scipy", "numba")
 
 
+@cache
 def code_hash(method: str = "crazyem") -> str:
     """Hash of all files on which the numbers of a method depend; only crazyem's numbers depend on the estimator."""
-    return _hash(method == "crazyem")
-
-
-@cache
-def _hash(with_estimator: bool) -> str:
     digest = hashlib.sha256()
     for path in sorted({p for pattern in _CODE for p in _PACKAGE.glob(pattern)}):
         name = path.relative_to(_PACKAGE).as_posix()
         ours = name == "paper/product.py" or name.startswith("estimation/")
-        if name not in _NOT_CODE and (with_estimator or not ours):
+        if name not in _NOT_CODE and (method == "crazyem" or not ours):
             digest.update(f"{name}\0{code_of(path)}\0".encode())
     return digest.hexdigest()[:16]
 
@@ -154,7 +150,7 @@ def assemble(
         "environment": environment(),
         **derived,
         "tasks": [{k: v for k, v in r.items() if k != "timing"} for r in ordered],
-        "timing": {**timing, **cost_profile(ordered)},
+        "timing": {**timing, "profile": cost_profile(ordered)},
     }
 
 
@@ -174,4 +170,4 @@ def cost_profile(records: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
             values = sorted(t[name] for t in timings if name in t)
             entry[name] = values[len(values) // 2]
         profile[kind] = entry
-    return {"profile": profile}
+    return profile

@@ -1,6 +1,5 @@
 """`crazyem paper`: stored tasks, damaged ones among them, the same results however it is run."""
 
-import argparse
 import json
 import os
 import shutil
@@ -76,7 +75,7 @@ def test_damage_is_noticed(tmp_path_factory: pytest.TempPathFactory, at: int, ch
     path = put_record(folder)
     content = path.read_bytes()
     at %= len(content)
-    path.write_bytes(content[:at] + change if not change else content[:at] + change + content[at + len(change) :])
+    path.write_bytes(content[:at] + change + (content[at + len(change) :] if change else b""))
     record, why = runner.stored(folder, TASK, "f")
     assert (record is None) == (why in ("damaged", "other"))
 
@@ -88,13 +87,10 @@ def test_damage_is_noticed(tmp_path_factory: pytest.TempPathFactory, at: int, ch
      b'{"fingerprint": "f", "record": {"experiment": "offline"}}'],
 )  # fmt: skip
 def test_things_that_are_no_records(tmp_path: Path, content: bytes) -> None:
-    put_record(tmp_path, content)
+    path = put_record(tmp_path, content)
     assert runner.stored(tmp_path, TASK, "f") == (None, "damaged")
-
-
-def test_a_huge_task_file_is_not_read(tmp_path: Path) -> None:
-    path = put_record(tmp_path)
-    os.truncate(path, runner.LARGEST_TASK_FILE + 1)
+    put_record(tmp_path)
+    os.truncate(path, runner.LARGEST_TASK_FILE + 1)  # too large to be read
     assert runner.stored(tmp_path, TASK, "f") == (None, "damaged")
 
 
@@ -126,7 +122,7 @@ def test_only_our_own_numbers_depend_on_the_estimator(tmp_path: Path, monkeypatc
     methods = ("crazyem", "published", "bound", "filter")
 
     def hashes() -> dict[str, str]:
-        runner._hash.cache_clear()
+        runner.code_hash.cache_clear()
         runner.code_of.cache_clear()
         return {m: runner.code_hash(m) for m in methods}
 
@@ -146,7 +142,7 @@ def test_only_our_own_numbers_depend_on_the_estimator(tmp_path: Path, monkeypatc
         assert changed("presets/zhao.toml") == list(methods)
     finally:
         monkeypatch.undo()
-        runner._hash.cache_clear()
+        runner.code_hash.cache_clear()
 
 
 def test_results_are_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -304,11 +300,3 @@ def test_settings_need_no_compiler() -> None:
     """Listing settings and refusing arguments must not wait for numba."""
     code = "import sys; from crazyem.cli import main; main(['paper', '--settings']); assert 'numba' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL, timeout=60)
-
-
-def test_parser_defaults() -> None:
-    from crazyem.cli import parser
-
-    arguments: argparse.Namespace = parser().parse_args(["paper"])
-    assert (arguments.experiment, arguments.sensor, arguments.method, arguments.seeds) == ("all", "all", "both", 20)
-    assert (arguments.jobs, arguments.cluster, arguments.out) == (None, None, "paper")

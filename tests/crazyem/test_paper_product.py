@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from crazyem.errors import UsageError
-from crazyem.estimation.online import OnlineEstimator
 from crazyem.paper.flight import Flight, fly
-from crazyem.paper.product import PARAMETERS, ProductOnline, estimator_for, known_noise, product_offline
+from crazyem.paper.product import PARAMETERS, ProductOnline, estimator_for, product_offline
 from crazyem.paper.settings import Settings
 
 SHORT = Settings(duration=3.0, window=200)
@@ -96,24 +95,15 @@ def test_one_update_for_every_four_rows_two_rows_behind():
     assert inertia.shape == (3,)
 
 
-def test_it_is_the_estimator_that_flies():
-    estimator = estimator_for(SHORT, "A")
-    assert type(estimator) is OnlineEstimator
-    assert (estimator.window, estimator.every) == (200, 4)
-
-
-def test_known_noise_is_that_of_the_simulation():
-    told = known_noise(SHORT)
-    assert (told.force, told.torque) == (SHORT.force_noise, SHORT.torque_noise)
-    assert told.position is None
-
-
-def test_what_does_not_exist_is_refused(flight):
-    with pytest.raises(UsageError, match="unknown sensor 'D'"):
-        product_offline(flight, "D")
-    with pytest.raises(UsageError, match="rows 5 to 5"):
-        product_offline(flight, "A", 5, 5)
-    with pytest.raises(UsageError, match="not in a flight"):
-        product_offline(flight, "A", 0, flight.size + 1)
-    with pytest.raises(UsageError, match="too short"):
-        product_offline(flight, "A", 0, 10)
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("D",), "unknown sensor 'D'"),
+        (("A", 5, 5), "rows 5 to 5"),
+        (("A", 0, 10**6), "not in a flight"),
+        (("A", 0, 10), "too short"),
+    ],
+)
+def test_what_does_not_exist_is_refused(flight, arguments, message):
+    with pytest.raises(UsageError, match=message):
+        product_offline(flight, *arguments)

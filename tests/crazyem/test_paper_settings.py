@@ -13,7 +13,7 @@ from crazyem.errors import UsageError
 from crazyem.paper import experiments
 from crazyem.paper.experiments import Task, plan, run_task
 from crazyem.paper.flight import Flight, fly
-from crazyem.paper.settings import LITERAL, Settings, _text, describe_text, settings_with
+from crazyem.paper.settings import LITERAL, Settings, _text, describe_text, described, settings_with
 
 SMALL = replace(Settings(), duration=1.5, window=200, every=20)
 
@@ -29,7 +29,7 @@ def test_settings_are_listed_with_their_reasons(capsys: pytest.CaptureFixture[st
     assert main(["paper", "--settings", "--set", "mass=0.2"]) == 0
     said = capsys.readouterr().out
     assert "mass = 0.2 kg" in said
-    for entry in Settings().describe():
+    for entry in described(Settings()):
         assert entry["name"] in said
         assert entry["reason"] in said
     assert "changed from 0.18 (printed (VI-B))" in said
@@ -64,11 +64,10 @@ def test_settings_that_are_refused(assignment: str, says: str | None) -> None:
         settings_with([assignment])
 
 
-def test_a_flight_that_is_too_long_together() -> None:
+@pytest.mark.parametrize("together", [("duration=600", "dt=0.0001"), ("duration=200", "dt=0.001", "substeps=100")])
+def test_a_flight_that_is_too_long_together(together: tuple[str, ...]) -> None:
     with pytest.raises(UsageError, match="too long"):
-        settings_with(["duration=600", "dt=0.0001"])
-    with pytest.raises(UsageError, match="too long"):
-        settings_with(["duration=200", "dt=0.001", "substeps=100"])
+        settings_with(together)
 
 
 @given(st.sampled_from([f.name for f in fields(Settings)]), st.text(max_size=40))
