@@ -75,36 +75,23 @@ def hover_speed(c: Constants) -> float:
     return math.sqrt(c.mass * GRAVITY / (4.0 * c.thrust_per_speed2))
 
 
-def _needs(*names: str) -> Callable[[Callable[..., float]], Callable[[Constants], float]]:
-    """Decorator: a function of quantities becomes a function of `Constants`, NaN if a quantity is unknown."""
-
-    def wrap(function: Callable[..., float]) -> Callable[[Constants], float]:
-        def of(c: Constants) -> float:
-            values = [hover_speed(c) if n == "hover_speed" else getattr(c, n) for n in names]
-            return math.nan if any(v is None or math.isnan(v) for v in values) else function(*values)
-
-        return of
-
-    return wrap
-
-
-# Quantities in files that follow from the constants: quantity -> function of the constants.
-DERIVED: dict[str, Callable[[Constants], float]] = {
-    "torque_per_speed2": _needs("thrust_per_speed2", "torque_per_thrust")(lambda k, r: k * r),
-    "speed_max": _needs("thrust_max", "thrust_per_speed2")(lambda t, k: math.sqrt(t / k)),
-    "thrust_to_weight": _needs("thrust_max", "mass")(lambda t, m: 4.0 * t / (m * GRAVITY)),
-    "arm_length": _needs("arm_x", "arm_y")(math.hypot),
-    "arm": _needs("arm_x", "arm_y")(lambda x, y: math.sqrt(x * y)),
-    "weight": _needs("mass")(lambda m: m * GRAVITY),
-    "hover_thrust": _needs("mass")(lambda m: m * GRAVITY / 4.0),
-    "total_thrust_max": _needs("thrust_max")(lambda t: 4.0 * t),
-    "torque_max": _needs("thrust_max", "torque_per_thrust")(lambda t, r: t * r),
-    "hover_share": _needs("mass", "thrust_max")(lambda m, t: m * GRAVITY / (4.0 * t)),
-    "hover_speed_share": _needs("mass", "thrust_max")(lambda m, t: math.sqrt(m * GRAVITY / (4.0 * t))),
-    "drag": _needs("drag_x", "drag_y", "drag_z")(lambda x, y, z: (x + y + z) / 3.0),
-    "damping": _needs("damping_x", "damping_y", "damping_z")(lambda x, y, z: (x + y + z) / 3.0),
-    "rotor_drag_xy": _needs("drag_x", "drag_y", "hover_speed")(lambda x, y, w: (x + y) / (8.0 * w)),
-    "rotor_drag_z": _needs("drag_z", "hover_speed")(lambda z, w: z / (4.0 * w)),
+# Quantities in files that follow from the constants: quantity -> quantities that give it, formula.
+DERIVED: dict[str, tuple[tuple[str, ...], Callable[..., float]]] = {
+    "torque_per_speed2": (("thrust_per_speed2", "torque_per_thrust"), lambda k, r: k * r),
+    "speed_max": (("thrust_max", "thrust_per_speed2"), lambda t, k: math.sqrt(t / k)),
+    "thrust_to_weight": (("thrust_max", "mass"), lambda t, m: 4.0 * t / (m * GRAVITY)),
+    "arm_length": (("arm_x", "arm_y"), math.hypot),
+    "arm": (("arm_x", "arm_y"), lambda x, y: math.sqrt(x * y)),
+    "weight": (("mass",), lambda m: m * GRAVITY),
+    "hover_thrust": (("mass",), lambda m: m * GRAVITY / 4.0),
+    "total_thrust_max": (("thrust_max",), lambda t: 4.0 * t),
+    "torque_max": (("thrust_max", "torque_per_thrust"), lambda t, r: t * r),
+    "hover_share": (("mass", "thrust_max"), lambda m, t: m * GRAVITY / (4.0 * t)),
+    "hover_speed_share": (("mass", "thrust_max"), lambda m, t: math.sqrt(m * GRAVITY / (4.0 * t))),
+    "drag": (("drag_x", "drag_y", "drag_z"), lambda x, y, z: (x + y + z) / 3.0),
+    "damping": (("damping_x", "damping_y", "damping_z"), lambda x, y, z: (x + y + z) / 3.0),
+    "rotor_drag_xy": (("drag_x", "drag_y", "hover_speed"), lambda x, y, w: (x + y) / (8.0 * w)),
+    "rotor_drag_z": (("drag_z", "hover_speed"), lambda z, w: z / (4.0 * w)),
 }
 
 # The inverse of DERIVED: quantity, quantities that give it, formula. The first formula with known inputs applies.
@@ -129,7 +116,13 @@ SOLVED: tuple[tuple[str, tuple[str, ...], Callable[..., float]], ...] = (
 
 def value_of(c: Constants, quantity: str) -> float:
     """The value of a quantity of `Constants` or `DERIVED`; NaN if unknown."""
-    return DERIVED[quantity](c) if quantity in DERIVED else c.or_(quantity, math.nan)
+    if quantity == "hover_speed":
+        return hover_speed(c)
+    if quantity not in DERIVED:
+        return c.or_(quantity, math.nan)
+    needs, function = DERIVED[quantity]
+    values = [value_of(c, n) for n in needs]
+    return math.nan if any(map(math.isnan, values)) else function(*values)
 
 
 def solved(found: Mapping[str, float]) -> dict[str, float]:
@@ -189,8 +182,6 @@ def to_vehicle(c: Constants, base: Vehicle | None = None) -> Vehicle:
     if c.mass is None or matrix is None:
         raise ValueError("a vehicle needs a mass and an inertia")
     plain = Vehicle(c.name, c.mass, (0.0, 0.0, 0.0)) if base is None else base
-    if base is not None and c.thrust_per_speed2 is None:
-        plain = replace(plain, rotor_constant=base.rotor_constant)
     effects: dict[str, dict[str, float]] = {}
     for effect in CATALOGUE.values():
         values = {name: c.or_(constant, 0.0) for name, constant in effect.constants.items()}

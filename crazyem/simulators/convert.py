@@ -15,7 +15,7 @@ from crazyem.simulators.cost import HORIZON, errors_after, flown, reference_flig
 from crazyem.simulators.fields import Contradiction, Format, SimulatorFile, read, write
 from crazyem.simulators.formats.rotorpy import ROTORPY, ROTORPY_JSON
 from crazyem.simulators.plausible import impossible, objection
-from crazyem.simulators.registry import FORMATS, OWN, format_named, format_of
+from crazyem.simulators.registry import OWN, format_named, format_of
 from crazyem.vehicle import Vehicle, preset_names
 
 # Quantities that a file holds or omits together: words for people, and the quantities.
@@ -193,10 +193,11 @@ def convert(
             f"vehicle {vehicle.name}: no {lacking}, which {form.words} needs (or a template that has it)"
         )
     text = write(form, constants, template=template, where=where, name=name)
-    said_there = _held(form, text, where=where, name=name)
-    omissions = _omissions(vehicle, constants, left, said_there, flight) if costs else []
+    # contradictions of the template stay in the file and are no error
+    written = read(form, text, where=where or f"the {form.name} file", name=name or None, strict=False).constants
+    omissions = _omissions(vehicle, constants, left, written, flight) if costs else []
     base = replace(without_effects(vehicle), motor_time_constant=0.0)  # a file without a lag means no lag
-    return Conversion(text, to, vehicle, to_vehicle(said_there, base), tuple(omissions))
+    return Conversion(text, to, vehicle, to_vehicle(written, base), tuple(omissions))
 
 
 # Key of a vehicle file -> its quantity, and the quantities in simulator files that need it.
@@ -214,11 +215,6 @@ def _lacking(form: Format, constants: Constants, name: str) -> str:
     drones = form.names(document)
     used = {f.quantity for f in form.fields(document, drones[0] if drones else "")}
     return next((k for k, (q, uses) in NEEDED.items() if getattr(constants, q) is None and used & {*uses}), "")
-
-
-def _held(form: Format, text: str, *, where: str, name: str) -> Constants:
-    """The constants in a written file. Contradictions of the template stay in the file and are no error."""
-    return read(form, text, where=where or f"the {form.name} file", name=name or None, strict=False).constants
 
 
 def _omissions(
@@ -278,11 +274,3 @@ def same(first: Constants, second: Constants, quantities: tuple[str, ...]) -> bo
     # products of inertia are compared with the moments of inertia: products alone may all be near 0
     scale = max(scale, 1e-6 * first.or_("inertia_xx", 0.0)) if quantities[0] == "inertia_xy" else scale
     return all(abs(a - b) <= max(HELD * scale, floor) for a, b in pairs)
-
-
-def known_formats() -> dict[str, str]:
-    """Name and description of every format."""
-    return {n: f.words for n, f in FORMATS.items() if n != ROTORPY_JSON.name}
-
-
-__all__ = ["Conversion", "Omission", "Source", "convert", "known_formats", "load_source", "read_text"]

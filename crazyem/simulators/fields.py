@@ -27,7 +27,7 @@ class Document(Protocol):
     @property
     def text(self) -> str: ...
     def get(self, path: Path) -> float | None: ...
-    def put(self, path: Path, value: float) -> bool: ...
+    def put(self, path: Path, value: float) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class SimulatorFile:
 
 def label_of(fields: Sequence[Field], quantity: str) -> str:
     """Label of the first field of a quantity, else of a field from which the quantity follows, else its own name."""
-    names = [quantity, *(d for d in _GIVERS.get(quantity, ()))]
+    names = [quantity, *_GIVERS.get(quantity, ())]
     found = next((f for n in names for f in fields if f.quantity == n), None)
     return quantity if found is None else f"{found.label} [{found.unit}]"
 

@@ -73,7 +73,8 @@ def sample(
         raise UsageError(f"vehicle {vehicle.name} has no [posterior]; diagnose --write-vehicle writes one.")
     _check(posterior, vehicle)
     rng = np.random.default_rng(seed)
-    root = _root(np.array(posterior.covariance, float))
+    variances, directions = np.linalg.eigh(np.array(posterior.covariance, float))
+    root = directions * np.sqrt(np.maximum(variances, 0.0))
     mean = np.array(posterior.mean, float)
     vehicles, draws = [], []
     for _ in range(count):
@@ -100,12 +101,6 @@ def _check(posterior: Posterior, vehicle: Vehicle) -> None:
         effect, _, name = key.partition(".")
         if effect not in CATALOGUE or name not in {p.name for p in CATALOGUE[effect].parameters}:
             raise UsageError(f"vehicle {vehicle.name}: its [posterior] has an unknown parameter '{key}'.")
-
-
-def _root(covariance: Array) -> Array:
-    values, vectors = np.linalg.eigh(covariance)
-    found: Array = vectors * np.sqrt(np.maximum(values, 0.0))
-    return found
 
 
 def _drawn(vehicle: Vehicle, parameters: Sequence[str], theta: Array) -> Vehicle:

@@ -70,8 +70,8 @@ class LiteralDocument(Spliced):
             return []
         return [str(k.value) for k in node.keys if isinstance(k, ast.Constant)]
 
-    def value(self, path: Path) -> Any:
-        """The number, text or list at a path; None for a dict or an unsupported expression."""
+    def get(self, path: Path) -> float | None:
+        """The number at a path; None if there is none, or an expression that is not supported."""
         node, rest = self._down(path)
         if node is None or isinstance(node, ast.Dict):
             return None
@@ -81,42 +81,40 @@ class LiteralDocument(Spliced):
                 found = found[step]
         except (UnknownError, IndexError, KeyError, TypeError):
             return None
-        return found
+        return as_number(found)
 
-    def get(self, path: Path) -> float | None:
-        """The number at a path; None if there is none."""
-        return as_number(self.value(path))
-
-    def put(self, path: Path, value: float) -> bool:
-        """Write a number at a path; False if there is no such place. A missing key is added to its dict."""
+    def put(self, path: Path, value: float) -> None:
+        """Write a number at a path, if there is such a place. A missing key is added to its dict."""
         node, rest = self._down(path)
-        if node is None or isinstance(node, ast.Dict):
-            return node is not None and len(rest) == 1 and self._added(node, str(rest[0]), value)
+        if isinstance(node, ast.Dict):
+            if len(rest) == 1:
+                self._add(node, str(rest[0]), value)
+            return
+        if node is None:
+            return
         if not rest:
             self._place(self._span(node), number_text(value))
-            return True
+            return
         span = self._span(node)
         source = self._edits[span].decode() if span in self._edits else None
         try:
             listed = self._value(node if source is None else ast.parse(source, mode="eval").body)
         except UnknownError:
-            return False
+            return
         if not isinstance(listed, Vector) or len(rest) != 1 or rest[0] >= len(listed):
-            return False
+            return
         listed = [*listed]
         listed[rest[0]] = value
         self._place(span, f"np.array([{', '.join(number_text(v) for v in listed)}])")
-        return True
 
-    def _added(self, node: ast.Dict, key: str, value: float) -> bool:
+    def _add(self, node: ast.Dict, key: str, value: float) -> None:
         if not node.keys or node.keys[-1] is None:
-            return False
+            return
         end = self._span(node.values[-1])[1]
         quote = chr(self._data[self._span(node.keys[-1])[0]])
         column = node.keys[-1].col_offset
         gap = "\n" + " " * column if node.keys[-1].lineno > node.lineno else " "
         self._insert(end, f",{gap}{quote}{key}{quote}: {number_text(value)}")
-        return True
 
     def _down(self, path: Path) -> tuple[ast.expr | None, Path]:
         """The deepest node along a path, and the remaining steps."""

@@ -97,25 +97,20 @@ class ParamDocument(SplicedText):
         super().__init__(text, where)
         self._found = {m["name"]: m for m in _LINE.finditer(text)}
 
-    def names(self) -> list[str]:
-        """Names of all parameters."""
-        return list(self._found)
-
     def get(self, path: Path) -> float | None:
         """The number of a parameter; None if it is not set."""
         found = self._found.get(path[0])
         return None if found is None else as_number(found["value"])
 
-    def put(self, path: Path, value: float) -> bool:
+    def put(self, path: Path, value: float) -> None:
         """Set a parameter; one that is missing is set after the last one."""
         found = self._found.get(path[0])
         if found is not None:
             self._place((self._at(found.start("value")), self._at(found.end("value"))), number_text(value))
-            return True
+            return
         last = next(reversed(self._found.values()), None)
         if last is None:
-            return False
+            return
         kind = "\t9" if last["head"][0].isdigit() else ""  # a ground station's code for a float
         text = f"\n{last['head']}{path[0]}{last['gap']}{number_text(value)}{kind}"
         self._insert(self._line_end(last.end()), text)
-        return True

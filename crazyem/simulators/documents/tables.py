@@ -33,15 +33,13 @@ class TomlDocument:
         """The number at a path; None if there is none."""
         return as_number(self._at(path))
 
-    def put(self, path: Path, value: float) -> bool:
-        """Write a number at a path; False if there is no such place. A missing key is added to its table."""
+    def put(self, path: Path, value: float) -> None:
+        """Write a number at a path, if there is such a place. A missing key is added to its table."""
         holder = self._at(path[:-1])
         if holder is None or isinstance(holder, int | float | str):
-            return False
-        if isinstance(path[-1], int) and path[-1] >= len(holder):
-            return False
-        holder[path[-1]] = float(number_text(value))
-        return True
+            return
+        if not isinstance(path[-1], int) or path[-1] < len(holder):
+            holder[path[-1]] = float(number_text(value))
 
     def _at(self, path: Path) -> Any:
         found: Any = self._document
@@ -80,21 +78,19 @@ class YamlDocument(SplicedText):
         node = self._node(path)
         return None if node is None or not isinstance(node.value, str) else as_number(node.value)
 
-    def put(self, path: Path, value: float) -> bool:
-        """Write a number at a path; False if there is no such place. A missing key is added to its mapping."""
+    def put(self, path: Path, value: float) -> None:
+        """Write a number at a path, if there is such a place. A missing key is added to its mapping."""
         node = self._node(path)
         if node is None:
-            return self._added(path, value)
-        if not isinstance(node.value, str):
-            return False
-        self._place((self._at(node.start_mark.index), self._at(node.end_mark.index)), number_text(value))
-        return True
+            self._add(path, value)
+        elif isinstance(node.value, str):
+            self._place((self._at(node.start_mark.index), self._at(node.end_mark.index)), number_text(value))
 
-    def _added(self, path: Path, value: float) -> bool:
+    def _add(self, path: Path, value: float) -> None:
         known = next(k for k in range(len(path) - 1, -1, -1) if self._node(path[:k]) is not None)
         parent = self._node(path[:known])
         if not _is_mapping(parent) or parent.flow_style or not parent.value:
-            return False
+            return
         key, last = parent.value[-1]
         indent = key.start_mark.column
         end = self._line_end(len(self._text[: last.end_mark.index].rstrip()))
@@ -102,7 +98,6 @@ class YamlDocument(SplicedText):
         text = "".join(f"\n{' ' * (indent + 2 * k)}{step}:" for k, step in enumerate(deeper)) + f" {number_text(value)}"
         present = self._edits.get((end, end), b"").decode()
         self._place((end, end), _merged(present, text))
-        return True
 
     def _node(self, path: Path) -> Any:
         node = self.root

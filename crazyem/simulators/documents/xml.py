@@ -107,8 +107,7 @@ class XmlDocument(Spliced):
         if path[index] != "#":
             found = element.attributes.get(path[index][1:])
             return None if found is None else (found[0].split(), found[1], found[2])
-        text = self.inner(element)
-        return text.split(), element.inside, element.end
+        return self.inner(element).split(), element.inside, element.end
 
     def get(self, path: Path) -> float | None:
         """The number at a path; None if there is none."""
@@ -116,37 +115,36 @@ class XmlDocument(Spliced):
         at = path[-1] if isinstance(path[-1], int) else 0
         return None if found is None or at >= len(found[0]) else as_number(found[0][at])
 
-    def put(self, path: Path, value: float) -> bool:
-        """Write a number at a path; False if there is no such place."""
+    def put(self, path: Path, value: float) -> None:
+        """Write a number at a path, if there is such a place. A missing element is added to its parent."""
         found = self.words(path)
         at = path[-1] if isinstance(path[-1], int) else 0
         if found is None:
-            return self._added(path, number_text(value))
+            self._add(path, number_text(value))
+            return
         words, start, end = found
         if at >= len(words):
-            return False
+            return
         now = self._edits.get((start, end), self._data[start:end]).decode()
         spans = [m.span() for m in re.finditer(r"\S+", now)]
         self._place((start, end), now[: spans[at][0]] + number_text(value) + now[spans[at][1] :])
-        return True
 
-    def put_vector(self, path: Path, values: Sequence[float]) -> bool:
+    def put_vector(self, path: Path, values: Sequence[float]) -> None:
         """Write numbers into an attribute or text; a missing one is added."""
         found, text = self.words(path), " ".join(map(number_text, values))
         if found is None:
-            return self._added(path, text)
-        self._place((found[1], found[2]), text)
-        return True
+            self._add(path, text)
+        else:
+            self._place((found[1], found[2]), text)
 
-    def _added(self, path: Path, text: str) -> bool:
+    def _add(self, path: Path, text: str) -> None:
         """Add a missing leaf `<tag>value</tag>` as the last child of its parent."""
         if path[-1] != "#" or len(path) < 2:
-            return False
+            return
         parent = self.find(path[:-2])
         if parent is None or not parent.children:
-            return False
+            return
         sibling = parent.children[-1]
         before = self._data[: sibling.start].decode()
         indent = before[len(before.rstrip(" \t\r\n")) :]
         self._insert(sibling.last, f"{indent}<{path[-2]}>{text}</{path[-2]}>")
-        return True

@@ -158,11 +158,9 @@ def _read_more(document: XmlDocument, name: str, found: dict[str, float]) -> lis
     found |= {f"inertia_{key[1:]}": float(inertia[i, j]) for key, i, j in _ELEMENTS}
     shift = np.where(np.abs(centre - parts.middle) < parts.rounding, 0.0, centre - parts.middle)
     found |= {f"centre_{a}": float(c) for a, c in zip("xyz", shift)}
-    if lags := _lags(document):
-        found["lag"] = float(np.sqrt(lags[0] * lags[1]))
-    elif _motors(_model(document)[1]):
-        found["lag"] = float(np.sqrt(np.prod(_DEFAULT_LAGS)))
+    lags = _lags(document)
     up, down = lags or _DEFAULT_LAGS
+    found["lag"] = float(np.sqrt(up * down))
     if abs(up / down - 1.0) < 0.01:
         return []
     said = "timeConstantUp and Down are" if lags else "timeConstantUp and Down are not set, so they are Gazebo's own"

@@ -13,6 +13,7 @@ from crazyem.errors import FileFormatError
 from crazyem.simulators.constants import Constants, inertia_of
 from crazyem.simulators.documents.literal import LiteralDocument
 from crazyem.simulators.fields import AGREE, Field, Format, template
+from crazyem.simulators.formats.crazyflow import speed_of
 from crazyem.simulators.layout import placed, read_positions
 from crazyem.vehicle import GRAVITY
 
@@ -119,15 +120,9 @@ def _write_more(document: LiteralDocument, name: str, c: Constants) -> None:
         put(("rotor_thrust_coefficients", i, j), float(value * factor), float(value))
     throttle = document.get((*root, "hovering_throttle_relative"))
     if throttle is not None and c.mass is not None:
-        a, b, q = laws.mean(axis=0) * factor
-        root_of = b * b - 4.0 * (a - c.mass * GRAVITY / 4.0) * q
-        if q > 0.0 and root_of >= 0.0 and high > low:
-            put(
-                ("hovering_throttle_relative",),
-                ((-b + math.sqrt(root_of)) / (2.0 * q) - low) / (high - low),
-                throttle,
-                ROUNDED,
-            )
+        command = speed_of(laws.mean(axis=0) * factor, c.mass * GRAVITY / 4.0)
+        if math.isfinite(command) and high > low:
+            put(("hovering_throttle_relative",), (command - low) / (high - low), throttle, ROUNDED)
 
 
 L2F = Format(
