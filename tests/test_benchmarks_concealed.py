@@ -4,45 +4,39 @@ import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parents[1]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def from_the_root() -> Iterator[None]:
-    """benchmarks is no installed package: `python -m benchmarks.concealed` finds it from the repository's folder."""
-    sys.path.insert(0, str(ROOT))
-    yield
-    sys.path.remove(str(ROOT))
-
-
-def drawn(cases: int, seed: int) -> list[dict[str, Any]]:
-    from benchmarks.concealed.draw import draw
-
-    return draw(cases=cases, seed=seed)
-
+from benchmarks.concealed import report as reports
+from benchmarks.concealed.__main__ import main
+from benchmarks.concealed.diagnose import diagnose_all
+from benchmarks.concealed.draw import draw, write_cases
+from benchmarks.concealed.fly import _words
+from benchmarks.concealed.judge import coverage, credit, errors, outside
+from benchmarks.concealed.paths import Study, read, write
+from benchmarks.concealed.report import report, table
+from benchmarks.concealed.score import QUANTITIES, Outcome, figures
+from benchmarks.concealed.sizes import CATALOGUE, OUTSIDE
+from crazyem.control.named_trajectories import waypoints
+from crazyem.vehicle import load_vehicle
+from firmware_sim.plant.effects.catalogue import EFFECTS, HIDDEN
+from firmware_sim.scenario import load_scenario
 
 # the draw
 
 
 def test_the_same_seed_draws_the_same_cases_and_another_others() -> None:
-    assert drawn(60, 1) == drawn(60, 1)
-    assert drawn(60, 1) != drawn(60, 2)
-    assert json.loads(json.dumps(drawn(20, 3))) == drawn(20, 3)
+    assert draw(cases=60, seed=1) == draw(cases=60, seed=1)
+    assert draw(cases=60, seed=1) != draw(cases=60, seed=2)
+    assert json.loads(json.dumps(draw(cases=20, seed=3))) == draw(cases=20, seed=3)
 
 
 @pytest.mark.parametrize(("cases", "seed"), [(60, 1), (320, 2025)])
 def test_shares_are_as_promised_and_every_effect_is_there(cases: int, seed: int) -> None:
-    from benchmarks.concealed.sizes import CATALOGUE, OUTSIDE
-    from firmware_sim.plant.effects.catalogue import EFFECTS, HIDDEN
-
-    found = drawn(cases, seed)
+    found = draw(cases=cases, seed=seed)
     kinds = Counter(c["kind"] for c in found)
     assert len(found) == len({c["case"] for c in found}) == cases
     assert kinds["nothing"] >= 0.2 * cases
@@ -58,17 +52,11 @@ def test_shares_are_as_promised_and_every_effect_is_there(cases: int, seed: int)
 
 
 def test_order_and_names_tell_nothing_of_the_kind() -> None:
-    kinds = np.array([c["kind"] == "nothing" for c in drawn(320, 2025)], float)
+    kinds = np.array([c["kind"] == "nothing" for c in draw(cases=320, seed=2025)], float)
     assert abs(np.corrcoef(kinds, np.arange(320))[0, 1]) < 4 / math.sqrt(320)
 
 
 def test_every_drawn_scenario_is_one_the_simulator_takes_and_every_path_one_that_can_be_flown(tmp_path: Path) -> None:
-    from benchmarks.concealed.draw import write_cases
-    from benchmarks.concealed.fly import _words
-    from benchmarks.concealed.paths import Study, read
-    from crazyem.control.named_trajectories import waypoints
-    from firmware_sim.scenario import load_scenario
-
     study = Study(tmp_path)
     assert write_cases(study, cases=60, seed=7) == 60
     assert write_cases(study, cases=60, seed=7) == 0  # what exists stays
@@ -82,9 +70,6 @@ def test_every_drawn_scenario_is_one_the_simulator_takes_and_every_path_one_that
 
 
 def test_drawn_products_of_inertia_belong_to_a_body() -> None:
-    from benchmarks.concealed.sizes import CATALOGUE
-    from crazyem.vehicle import load_vehicle
-
     vehicle, random = load_vehicle("cf2"), np.random.default_rng(0)
     for u in (0.0, 0.9, 1.0):
         for _ in range(300):
@@ -96,11 +81,6 @@ def test_drawn_products_of_inertia_belong_to_a_body() -> None:
 
 
 def test_the_truth_without_effects_is_the_nominal_vehicle(tmp_path: Path) -> None:
-    from benchmarks.concealed.draw import write_cases
-    from benchmarks.concealed.paths import Study
-    from crazyem.vehicle import load_vehicle
-    from firmware_sim.scenario import load_scenario
-
     write_cases(Study(tmp_path), cases=1, seed=1)
     for name in ("cf2", "cf21bl"):
         file = tmp_path / "plain.toml"
@@ -139,15 +119,10 @@ def effect(name: str, confidence: float = 0.9, **parameters: tuple[float, float,
     ],
 )
 def test_credit_of_a_name(result: dict[str, Any] | None, worth: float) -> None:
-    from benchmarks.concealed.judge import credit
-
     assert credit("payload", result) == worth
 
 
 def test_errors_are_of_the_size_of_the_effect() -> None:
-    from benchmarks.concealed.judge import coverage, errors
-    from crazyem.vehicle import load_vehicle
-
     vehicle = load_vehicle("cf2")
     found = effect("thrust_scale", scale=(1.06, 1.02, 1.10))
     assert errors("thrust_scale", {"scale": 1.05}, found, vehicle) == {"": pytest.approx(0.2)}
@@ -161,8 +136,6 @@ def test_errors_are_of_the_size_of_the_effect() -> None:
 
 
 def test_outside_the_catalogue() -> None:
-    from benchmarks.concealed.judge import outside
-
     where = [{"signal": "attitude", "axis": "z", "regime": "x -1 to -0.5 m"}]
     right = {"mismatch": True, "effects": [], "unexplained": {"where": where}}
     assert outside("magnetic_yaw", right) == {"unexplained": True, "axis": True, "regime": True, "wrong_name": False}
@@ -186,9 +159,6 @@ def truth(kind: str, strength: float = 0.9, **effects: Any) -> dict[str, Any]:
 
 
 def test_figures_of_made_up_answers_are_those_counted_by_hand() -> None:
-    from benchmarks.concealed.report import table
-    from benchmarks.concealed.score import QUANTITIES, Outcome, figures
-
     scale = {"thrust_scale": {"scale": 1.1}}
     good = effect("thrust_scale", 0.96, scale=(1.11, 1.09, 1.13))
     one, twice = dict.fromkeys(QUANTITIES, 1.0), dict.fromkeys(QUANTITIES, 2.0)
@@ -243,9 +213,6 @@ def test_figures_of_made_up_answers_are_those_counted_by_hand() -> None:
 
 
 def test_no_cases_give_no_figures_rather_than_good_ones() -> None:
-    from benchmarks.concealed.report import table
-    from benchmarks.concealed.score import figures
-
     f = figures([])
     assert f["nothing"]["false_alarms"] == {"n": 0, "share": None}
     assert "not measured" in table(f)
@@ -255,10 +222,6 @@ def test_no_cases_give_no_figures_rather_than_good_ones() -> None:
 
 
 def test_the_diagnosing_process_sees_two_recordings_and_a_name(tmp_path: Path) -> None:
-    from benchmarks.concealed.diagnose import diagnose_all
-    from benchmarks.concealed.paths import Study, read, write
-    from benchmarks.concealed.report import report
-
     study = Study(tmp_path / "study")
     write(study.truth("0001"), {**truth("nothing"), "quality": {}})
     for flight in ("recording", "held_out"):
@@ -286,8 +249,6 @@ def test_the_diagnosing_process_sees_two_recordings_and_a_name(tmp_path: Path) -
 
 
 def test_the_documents_tell_of_two_flights_alone(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    from benchmarks.concealed.__main__ import main
-
     with pytest.raises(SystemExit) as ended:
         main(["score", "--out", str(tmp_path), "--alone", "--write-docs"])
     assert ended.value.code == 2
@@ -295,16 +256,13 @@ def test_the_documents_tell_of_two_flights_alone(capsys: pytest.CaptureFixture[s
 
 
 def test_the_ideal_observer_is_asked_for_what_went_wrong_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from benchmarks.concealed import report
-    from benchmarks.concealed.paths import Study, write
-
     study, asked = Study(tmp_path), []
     for case, said in (("0001", "wind"), ("0002", "gusts")):
         write(study.truth(case), {**truth("single", wind={"x": 1.0}), "case": case})
         write(study.answer(case), {"result": answer(effect(said)), "seconds": 1.0})
-    monkeypatch.setattr(report, "ideal_nats", lambda recording, *_, **__: asked.append(recording.parent.name) or 3.0)
-    monkeypatch.setattr(report, "held_out_error", lambda *_, **__: pytest.fail("predictions are not asked for"))
-    assert [o.nats for o in report.outcomes(study, ideal="kept")] == [None, None]
-    assert [o.nats for o in report.outcomes(study, ideal="failures")] == [None, 3.0]
-    assert [o.nats for o in report.outcomes(study, ideal="failures")] == [None, 3.0]  # kept
+    monkeypatch.setattr(reports, "ideal_nats", lambda recording, *_, **__: asked.append(recording.parent.name) or 3.0)
+    monkeypatch.setattr(reports, "held_out_error", lambda *_, **__: pytest.fail("predictions are not asked for"))
+    assert [o.nats for o in reports.outcomes(study, ideal="kept")] == [None, None]
+    assert [o.nats for o in reports.outcomes(study, ideal="failures")] == [None, 3.0]
+    assert [o.nats for o in reports.outcomes(study, ideal="failures")] == [None, 3.0]  # kept
     assert asked == ["0002"]

@@ -3,35 +3,37 @@
 import copy
 import json
 import math
-import sys
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parents[1]
+from benchmarks.concealed.conditions import GAINS, PERIODS, STYLES
+from benchmarks.concealed.courses import course, size_of
+from benchmarks.concealed.draw import draw
+from benchmarks.concealed.foreign import fly as fly_abroad
+from benchmarks.concealed.foreign_world import ABROAD, HIDEABLE, changed, constants, published
+from benchmarks.concealed.ideal import held_out_error
+from benchmarks.concealed.judge import named, without
+from benchmarks.concealed.random_world import gains, scenario_of
+from benchmarks.concealed.score import wilson
+from benchmarks.concealed.simulate import boot, fly
+from crazyem.recordings.contents import ReadOptions
+from crazyem.recordings.registry import open_recording
+from crazyem.vehicle import parse_vehicle
+from firmware_sim.scenario import parse_scenario
+
 Table = dict[str, Any]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def from_the_root() -> Iterator[None]:
-    """benchmarks is no installed package: it is found from the repository's folder."""
-    sys.path.insert(0, str(ROOT))
-    yield
-    sys.path.remove(str(ROOT))
-
-
 def drawn(cases: int, seed: int, world: str) -> list[Table]:
-    from benchmarks.concealed.draw import draw
-
     return draw(cases=cases, seed=seed, world=world)
 
 
 @pytest.fixture(scope="module")
-def many(from_the_root: None) -> list[Table]:
+def many() -> list[Table]:
     return drawn(150, 3, "random")
 
 
@@ -47,8 +49,6 @@ def test_the_same_seed_draws_the_same_random_world_and_the_order_of_worlds_chang
 
 
 def test_everything_that_can_differ_differs(many: list[Table]) -> None:
-    from benchmarks.concealed.conditions import GAINS, PERIODS, STYLES
-
     logs = [c["conditions"]["log"] for c in many]
     assert {c["conditions"]["controller"] for c in many} == set(GAINS)
     assert {f["style"] for c in many for f in c["flights"].values()} == {*STYLES, "low"}
@@ -80,8 +80,6 @@ def test_sizes_of_what_differs_are_those_that_are_written(many: list[Table]) -> 
 
 
 def test_trims_of_days_scatter_around_the_drones_own(many: list[Table]) -> None:
-    from benchmarks.concealed.random_world import scenario_of
-
     apart, own = [], []
     for case in (c for c in many if "trim" in c["own"]):
         own.append([case["own"]["trim"][a] for a in "xyz"])
@@ -109,10 +107,6 @@ def test_what_is_hidden_can_be_seen_in_what_is_logged(many: list[Table]) -> None
 
 @pytest.mark.parametrize("controller", ["pid", "mellinger", "lee", "lqg"])
 def test_every_key_of_a_case_is_one_that_the_simulator_takes(many: list[Table], controller: str) -> None:
-    from benchmarks.concealed.random_world import gains, scenario_of
-    from benchmarks.concealed.simulate import boot
-    from firmware_sim.scenario import parse_scenario
-
     cases = [c for c in many if c["conditions"]["controller"] == controller]
     for case in cases:
         for flight in case["flights"]:
@@ -129,8 +123,6 @@ def test_every_key_of_a_case_is_one_that_the_simulator_takes(many: list[Table], 
 
 
 def test_gains_are_the_platforms_times_what_was_drawn(many: list[Table]) -> None:
-    from benchmarks.concealed.random_world import gains
-
     case = next(c for c in many if c["conditions"]["controller"] == "lee")
     factor = case["conditions"]["gains"]["ctrlLee.KR_x"]
     assert gains(case)["ctrlLee.KR_x"] == pytest.approx(0.007 * factor)
@@ -140,8 +132,6 @@ def test_gains_are_the_platforms_times_what_was_drawn(many: list[Table]) -> None
 
 @pytest.mark.parametrize("style", ["helix", "vertical", "oval", "star", "multisine", "draught", "figure8", "excite"])
 def test_courses_rise_hover_move_and_land_without_jumps(style: str) -> None:
-    from benchmarks.concealed.courses import course, size_of
-
     for seed in range(3):
         size = size_of(style, np.random.default_rng(seed))
         path = course({"style": style, "size": size, "waypoints": None}, 8.0)
@@ -169,10 +159,6 @@ def plain(many: list[Table], estimate: str) -> Table:
 
 @pytest.mark.parametrize("estimate", ["kalman", "none"])
 def test_a_flight_is_the_same_twice_and_logged_as_drawn(many: list[Table], tmp_path: Path, estimate: str) -> None:
-    from benchmarks.concealed.simulate import fly
-    from crazyem.recordings.contents import ReadOptions
-    from crazyem.recordings.registry import open_recording
-
     case, suffix = plain(many, estimate), ".mcap" if estimate == "kalman" else ".csv"
     read = []
     for turn in ("a", "b"):
@@ -196,9 +182,6 @@ def test_a_flight_is_the_same_twice_and_logged_as_drawn(many: list[Table], tmp_p
 @pytest.mark.slow
 def test_a_plain_random_flight_is_what_its_vehicle_file_predicts(many: list[Table], tmp_path: Path) -> None:
     """Hardly any noise, nothing hidden, all commands logged: 0.5 s ahead by the file's constants."""
-    from benchmarks.concealed.ideal import held_out_error
-    from benchmarks.concealed.simulate import fly
-
     case = plain(many, "kalman")
     case["conditions"]["log"].update(command_period=2, period=2, loss=0.0)
     scenario = case["conditions"]["scenario"]
@@ -218,8 +201,6 @@ def test_a_plain_random_flight_is_what_its_vehicle_file_predicts(many: list[Tabl
 
 
 def test_what_is_set_aside_is_neither_an_alarm_nor_a_find() -> None:
-    from benchmarks.concealed.judge import named, without
-
     answer = {
         "mismatch": True,
         "effects": [{"name": "linear_drag"}, {"name": "payload"}],
@@ -239,8 +220,6 @@ def test_what_is_set_aside_is_neither_an_alarm_nor_a_find() -> None:
 
 
 def test_intervals_of_shares_are_wilsons() -> None:
-    from benchmarks.concealed.score import wilson
-
     # Brown, Cai, DasGupta (2001), eq. 4; by hand for 0 of 10: upper end z^2 / (n + z^2)
     assert wilson(0.0, 10) == pytest.approx((0.0, 0.27753), abs=1e-4)
     assert wilson(0.5, 10) == pytest.approx((0.23659, 0.76341), abs=1e-4)
@@ -256,8 +235,6 @@ def foreign(cases: int, seed: int) -> list[Table]:
 
 
 def test_foreign_cases_hide_what_the_simulator_can_and_are_the_same_twice() -> None:
-    from benchmarks.concealed.foreign_world import ABROAD, HIDEABLE
-
     cases = foreign(60, 2)
     assert cases == foreign(60, 2)
     assert json.loads(json.dumps(cases)) == cases
@@ -270,9 +247,6 @@ def test_foreign_cases_hide_what_the_simulator_can_and_are_the_same_twice() -> N
 
 
 def test_hidden_effects_are_changes_of_the_foreign_simulators_parameters() -> None:
-    from benchmarks.concealed.foreign_world import changed, constants
-    from crazyem.vehicle import parse_vehicle
-
     case = next(c for c in foreign(20, 2) if c["kind"] == "nothing" and not c["own"])
     known, file = constants(case["platform"]), parse_vehicle(case["vehicle"])
     untouched = changed(case, "recording")
@@ -302,10 +276,6 @@ def test_hidden_effects_are_changes_of_the_foreign_simulators_parameters() -> No
 def test_a_plain_foreign_flight_is_what_its_vehicle_file_predicts(tmp_path: Path, platform: str) -> None:
     """Little noise, nothing hidden: 0.5 s ahead by the file's constants, rotors' order and signs of the mapping."""
     cases = foreign(30, 2)
-    from benchmarks.concealed.foreign import fly
-    from benchmarks.concealed.foreign_world import published
-    from benchmarks.concealed.ideal import held_out_error
-
     case = copy.deepcopy(next(c for c in cases if c["kind"] == "nothing"))
     vehicle = published(platform, {})
     case.update(platform=platform, air="none", own={}, built={}, vehicle=vehicle.to_toml())
@@ -318,7 +288,7 @@ def test_a_plain_foreign_flight_is_what_its_vehicle_file_predicts(tmp_path: Path
     )
     noise = case["conditions"]["noise"]
     noise.update(position=1e-5, attitude=1e-5, velocity=1e-4, body_rate=1e-4, gyro_offset=0.0, motor=0.02, share=0.0)
-    assert fly(case, "recording", tmp_path, duration=5.0)["flown"]
+    assert fly_abroad(case, "recording", tmp_path, duration=5.0)["flown"]
     (tmp_path / "drone.toml").write_text(case["vehicle"])
     error = held_out_error(tmp_path / "recording.csv", str(tmp_path / "drone.toml"), mapping=tmp_path / "mapping.toml")
     assert error is not None

@@ -6,7 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from crazyem.paper.experiments import PATH_POINTS, thin
+from crazyem.paper.runner import assemble
 from crazyem.paper.settings import Settings
+from crazyem.paper.tables import derive
 
 TRUE = np.array([0.18, 2.5e-4, 3.1e-4, 2.0e-4])
 BOUND = np.array([0.001, 0.04, 0.05, 0.06])  # relative
@@ -83,12 +85,9 @@ def whole_run(seeds: int, *, spread: float = 1.0, updates: int = 1000) -> list[d
     return records
 
 
-def results_of(records: list[dict[str, Any]], settings: Settings | None = None) -> dict[str, Any]:
+def results_of(records: list[dict[str, Any]]) -> dict[str, Any]:
     """results.json of such records, figures left out."""
-    from crazyem.paper.runner import assemble
-    from crazyem.paper.tables import derive
-
-    settings = settings or Settings()
+    settings = Settings()
     timing = {"jobs": 2, "tasks_reused": 0, "simulations_s": 1.0, "figures": 0, "figures_s": 1.0, "wall_s": 2.0}
     return assemble(records, settings, {**derive(records, settings), "figures": []}, timing)
 

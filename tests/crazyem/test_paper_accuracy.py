@@ -1,12 +1,11 @@
 """The accuracy study: its figures on records made by hand, small studies against the bound, and the page it writes."""
 
-import importlib.util
 import json
 from dataclasses import asdict, replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
+import paper_accuracy as benchmark
 import pytest
 from accuracy_study import PARTS, Record, missed, settings_of, stretches, study, summary, table
 from hypothesis import given
@@ -14,14 +13,6 @@ from hypothesis import strategies as st
 
 from crazyem.errors import UsageError
 from crazyem.paper.settings import Settings
-
-ROOT = Path(__file__).resolve().parents[2]
-
-spec = importlib.util.spec_from_file_location("paper_accuracy", ROOT / "benchmarks" / "paper_accuracy.py")
-assert spec is not None
-assert spec.loader is not None
-benchmark = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(benchmark)
 
 
 def made(seed: int, z, efficient=None, *, sd: float = 0.1) -> Record:
