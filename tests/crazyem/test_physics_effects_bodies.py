@@ -8,7 +8,6 @@ from effects_cases import CF2, G, still, wild
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
-from scipy.spatial.transform import Rotation
 
 from crazyem.physics.effects.effect import Effects
 from crazyem.physics.effects.pendulum import swing_along, swing_on
@@ -69,14 +68,6 @@ def test_payload_on_a_crooked_body_is_an_assembly_of_points(seed: int) -> None:
         specific, angular = rigid_points([*masses, 0.006], [*places, place], force, rotors[1:], situation.body_rate[k])
         np.testing.assert_allclose(found.specific_force[k], specific, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(found.angular_acceleration[k], angular, rtol=1e-9, atol=1e-7)
-
-
-def test_a_payload_in_front_pitches_the_nose_down_and_one_on_the_left_rolls_left() -> None:
-    hover = still(thrust=(0.029 + 0.002) * G / 4)
-    front = motion(hover, vehicle=CF2, effects={"payload": {"mass": 0.002, "x": 0.03}})
-    assert front.angular_acceleration[0, 1] > 10.0  # positive pitch is nose down
-    left = motion(hover, vehicle=CF2, effects={"payload": {"mass": 0.002, "y": 0.03}})
-    assert left.angular_acceleration[0, 0] < -10.0  # positive roll lifts the left
 
 
 def test_inertia_replaces_what_is_given_and_keeps_the_rest() -> None:
@@ -152,12 +143,6 @@ def test_tension_is_that_of_the_coupled_system(seed: int) -> None:
         np.testing.assert_allclose(found.angular_acceleration[k], expected[3:6], rtol=1e-8, atol=1e-6)
 
 
-def test_a_load_that_hangs_still_weighs_what_it_weighs() -> None:
-    hover = still(5, thrust=(0.029 + 0.004) * G / 4)
-    found = motion(hover, vehicle=CF2, effects={"suspended_load": {"mass": 0.004}})
-    np.testing.assert_allclose(found.specific_force, np.tile([0, 0, G], (5, 1)), atol=1e-9)
-
-
 def pivot(t, amplitude=1.0):
     """Velocity and acceleration of a pivot that wanders in three directions."""
     w = np.array([2.1, 3.3, 1.7])
@@ -230,21 +215,3 @@ def test_swing_knows_no_later_row_and_starts_anew_after_a_gap(at: int, size: flo
     np.testing.assert_array_equal(broken[at], [0, 0, -1, 0, 0, 0])
     apart = replace(path, time=path.time + np.where(np.arange(200) >= at, 0.5, 0.0))
     np.testing.assert_allclose(swing_of(apart, length=0.3), broken, atol=1e-9)
-
-
-def test_a_swing_to_the_left_pulls_to_the_left() -> None:
-    tilted = np.array([[0.0, 0.5, -np.sqrt(0.75), 0, 0, 0]])
-    situation = replace(still(thrust=0.08), swing=tilted)
-    found = motion(situation, vehicle=CF2, effects={"suspended_load": {"mass": 0.003, "length": 0.3}})
-    assert found.specific_force[0, 1] > 0.1
-
-
-def test_swing_turns_with_the_world_and_not_with_the_drone() -> None:
-    """A level drone that flies the same path under another heading has the same force, in its own axes."""
-    time = 0.01 * np.arange(100)
-    v, _ = pivot(time)
-    turned = Rotation.from_euler("z", 1.0).as_matrix()
-    effects: Effects = {"suspended_load": {"mass": 0.003, "length": 0.3}}
-    one = motion(still(100, velocity=v), vehicle=CF2, effects=effects)
-    other = motion(still(100, velocity=v, rotation=turned), vehicle=CF2, effects=effects)
-    np.testing.assert_allclose(other.specific_force, one.specific_force @ turned, atol=1e-12)

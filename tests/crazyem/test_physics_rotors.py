@@ -3,7 +3,6 @@
 import csv
 import gzip
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -69,19 +68,6 @@ def test_nan_stays_where_it_is():
     assert thrust[0, 2] == 0.0
     wrench = rotors.wrench_from_command(command, np.array([4.0, np.nan]), CF2)
     assert np.all(np.isnan(wrench))
-
-
-@given(st.floats(0.3, 0.9), st.floats(3.2, 4.2))
-def test_thrust_and_hence_mass_scale_with_the_curve(duty, voltage):
-    """A k % error of the curve is a k % error of the force: only mass over thrust scale is observable."""
-    scaled = replace(CF2, thrust_curve=tuple(1.07 * c for c in CF2.thrust_curve))
-    command = np.array([duty, 0.9 * duty, duty, 0.8 * duty])
-    np.testing.assert_allclose(
-        rotors.wrench_from_command(command, np.float64(voltage), scaled),
-        1.07 * rotors.wrench_from_command(command, np.float64(voltage), CF2),
-        rtol=1e-12,
-        atol=1e-18,
-    )
 
 
 def test_rotor_speeds():
