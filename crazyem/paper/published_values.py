@@ -121,9 +121,5 @@ class Correction:
     why: str
 
 
-def _corrections() -> tuple[Correction, ...]:
-    text = (resources.files("crazyem.paper") / "corrections.toml").read_text(encoding="utf-8")
-    return tuple(Correction(**entry) for entry in tomllib.loads(text)["correction"])
-
-
-CORRECTIONS = _corrections()
+_TEXT = (resources.files("crazyem.paper") / "corrections.toml").read_text(encoding="utf-8")
+CORRECTIONS = tuple(Correction(**entry) for entry in tomllib.loads(_TEXT)["correction"])

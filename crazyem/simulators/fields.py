@@ -206,7 +206,8 @@ def read(form: Format, text: str, *, where: str, name: str | None = None, strict
     values = {n: v for n, v in solved(found).items() if n in NUMBERS}
     if "lag" in values and 0.0 < values["lag"] <= SHORTEST_LAG * (1.0 + AGREE):
         values["lag"] = 0.0
-    constants = Constants(drone or _stem(where), **values)
+    stem = where.replace("\\", "/").rsplit("/", 1)[-1].split(".")[0]
+    constants = Constants(drone or stem or "drone", **values)
     problem = objection(constants, lambda q: label_of(fields, q))
     if problem:
         raise FileFormatError(f"{where}: {problem}")
@@ -309,7 +310,3 @@ def drone_of(form: Format, document: Any, name: str | None) -> str:
         return str(name)
     asked = f"no drone '{name}'" if name else "several drones"
     raise UsageError(f"{document.where}: {asked} in this file; --name chooses one of {', '.join(names)}.")
-
-
-def _stem(where: str) -> str:
-    return where.replace("\\", "/").rsplit("/", 1)[-1].split(".")[0] or "drone"
