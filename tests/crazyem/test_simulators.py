@@ -18,6 +18,7 @@ from crazyem.simulators.registry import FORMATS, NAMES, OWN, format_of
 from crazyem.vehicle import Vehicle, load_vehicle
 
 RPM = 60.0 / (2.0 * math.pi)
+ROTORPY_HOVER = math.sqrt(0.03 * 9.81 / 4 / 2.3e-8)  # rad/s
 INERTIA = {f"inertia_{a}" for a in ("xx", "yy", "zz")}
 PRODUCTS = {f"inertia_{a}" for a in ("xy", "xz", "yz")}
 CENTRE = {f"centre_{a}" for a in "xyz"}
@@ -123,14 +124,9 @@ def test_constants_become_a_vehicle_and_back(drone: Constants) -> None:
     assert differing(drone, found, set(NUMBERS)) == []
 
 
-@pytest.mark.parametrize("name", PUBLISHED)
-def test_a_text_is_told_by_its_content(name: str) -> None:
-    assert format_of(PUBLISHED[name], where="file") == name
-
-
-def test_a_vehicle_file_is_told_by_its_content() -> None:
-    assert format_of(load_vehicle("cf2").to_toml(), where="file") == OWN
-    assert set(PUBLISHED) | {OWN} == set(NAMES)
+def test_a_text_is_told_by_its_content() -> None:
+    texts = {**PUBLISHED, OWN: load_vehicle("cf2").to_toml()}
+    assert {name: format_of(text, where="file") for name, text in texts.items()} == {name: name for name in NAMES}
 
 
 def imported(name: str, text: str | None = None, *, strict: bool = True) -> SimulatorFile:
@@ -152,13 +148,10 @@ def with_both_controllers(text: str) -> str:
 
 
 def test_a_second_controller_is_added_where_it_is_missing() -> None:
-    text = write(
-        FORMATS["crazyswarm2"], imported("crazyswarm2").constants, template=PUBLISHED["crazyswarm2"], name="cf231"
-    )
-    assert text == with_both_controllers(PUBLISHED["crazyswarm2"])
-    text = write(
-        FORMATS["crazyswarm2"], imported("crazyswarm2").constants, template=PUBLISHED["crazyswarm2"], name="cf5"
-    )
+    constants, template = imported("crazyswarm2").constants, PUBLISHED["crazyswarm2"]
+    text = write(FORMATS["crazyswarm2"], constants, template=template, name="cf231")
+    assert text == with_both_controllers(template)
+    text = write(FORMATS["crazyswarm2"], constants, template=template, name="cf5")
     assert read(FORMATS["crazyswarm2"], text, where="x", name="cf5").constants.inertia_zz == 29.26e-6
 
 
@@ -206,7 +199,10 @@ def test_a_centre_of_mass_moves_rotors_and_links() -> None:
         # the body's centre is 21 mm below the rotors, and carries 25 of 28.2 g
         ("gazebo", "centre_z", -0.021 * 25 / 28.2), ("gazebo", "lag", 1 / math.sqrt(80 * 40)),
         ("rotorpy", "arm_x", 0.043 / math.sqrt(2)), ("rotorpy", "thrust_max", 2.3e-8 * 2500**2),
-        ("rotorpy", "drag_x", 4 * 10.2506e-7 * math.sqrt(0.03 * 9.81 / 4 / 2.3e-8)),
+        ("rotorpy", "drag_x", 4 * 10.2506e-7 * ROTORPY_HOVER),
+        # four forces -D/4 (w x r) at the corners
+        ("rotorpy", "damping_x", 4 * 7.553e-7 * ROTORPY_HOVER * 0.043**2 / 2),
+        ("rotorpy", "damping_z", 4 * 10.2506e-7 * ROTORPY_HOVER * 0.043**2),
         ("crazyswarm2", "inertia_yy", 16.66e-6), ("px4-sih", "torque_per_thrust", 0.02), ("px4-sih", "lag", 0.05),
         ("omnidrones", "arm_x", 0.048 / math.sqrt(2)), ("omnidrones", "torque_per_thrust", 7.24e-10 / 2.88e-8),
         ("l2f", "thrust_max", 0.149), ("l2f", "lag", math.sqrt(0.05 * 0.08)),
@@ -242,14 +238,6 @@ def test_a_payload_is_folded_exactly() -> None:
     assert made.held.inertia_products[1] == pytest.approx(reduced * 0.02 * 0.01)
     assert made.held.effects["center_of_mass"]["x"] == pytest.approx(0.002)
     assert made.omissions == ()
-
-
-def test_drag_at_the_rotors_of_rotorpy_damps_rotation() -> None:
-    """Four forces -D/4 (w x r) at the corners, written out."""
-    c = imported("rotorpy").constants
-    hover = math.sqrt(0.03 * 9.81 / 4 / 2.3e-8)
-    assert c.damping_x == pytest.approx(4 * 7.553e-7 * hover * 0.043**2 / 2)
-    assert c.damping_z == pytest.approx(4 * 10.2506e-7 * hover * 0.043**2)
 
 
 def test_what_a_file_cannot_hold_costs_something() -> None:
