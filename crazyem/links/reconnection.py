@@ -56,6 +56,7 @@ class Reconnector:
         if self._cf.link is None or another:
             self._another_driver()
         self._check_tables(blocks)
+        blocks.hold()  # packets from before these answers may be those of the drone before a restart
         created = blocks.resume(deadline)
         if blocks.reset_since():
             raise AnotherDroneError(f"The drone at {self._uri} was restarted: what it knew of the flight is gone.")

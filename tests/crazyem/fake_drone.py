@@ -158,7 +158,8 @@ class FakeLink:
         if self.packets.qsize() > most:
             return "packets"
         waiting = self.packets.qsize() + (s._samples.qsize() if s._mailbox is None else len(s._mailbox._items))
-        if waiting > most and self.fm >= self._free_until["samples"]:
+        stalled = getattr(s.pipeline.estimator, "stalled", False)  # on purpose
+        if waiting > most and not stalled and self.fm >= self._free_until["samples"]:
             return "samples"
         busy = self._unseen() or (s.pusher is not None and s.pusher.busy)
         return "flight" if busy and self.fm >= self._free_until["flight"] else ""

@@ -37,7 +37,7 @@ class Estimator(fake.FakeEstimator):
         super().__init__()
         self.fail_at = fail_at
         self.values = {**fake.TRUTH, **(values or {})}
-        self.stall_at, self.released = stall_at, threading.Event()
+        self.stall_at, self.released, self.stalled = stall_at, threading.Event(), False
 
     def finish(self):
         base = super().finish()
@@ -49,6 +49,7 @@ class Estimator(fake.FakeEstimator):
 
     def feed(self, sample):
         if self.stall_at is not None and self.n >= self.stall_at:
+            self.stalled = not self.released.is_set()  # the drone does not wait for it
             self.released.wait(600.0)
         if self.fail_at is not None and self.n >= self.fail_at:
             raise ValueError("boom")

@@ -15,6 +15,7 @@ from relayed import connected, down, now_on, relayed, up
 from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import LinkLost, Packet
 from crazyem.links.connection import _Progress, new_crazyflie
+from crazyem.links.reconnection import Reconnector
 from crazyem.live.session import LOG_RATE
 from crazyem.signals.vocabulary import STATE_VARIABLES, standard_variables
 
@@ -332,6 +333,27 @@ def test_a_restarted_drone_is_not_taken_for_the_same(clock_peer, lost):
             link.reconnect(60.0)
         assert not link.can_reconnect
         assert not any(isinstance(p, Packet) and p.firmware_time_ms < 50_000 for p in take(link, 0.3))
+
+
+def test_a_packet_from_before_a_restart_does_not_hide_the_restart(clock_peer, lost, monkeypatch):
+    clock_peer.first_stamp = 50_000
+    check = Reconnector._check_tables
+
+    def after_an_old_packet(self, blocks):
+        for _, config, receive in blocks._running.values():
+            receive(round(blocks.newest_ms) + 10, dict.fromkeys(NAMES, 0.0), config)
+        check(self, blocks)
+
+    monkeypatch.setattr(Reconnector, "_check_tables", after_an_old_packet)
+    with relayed(clock_peer.uri) as relay, connected(relay.uri) as link:
+        link.subscribe(NAMES, 100.0)
+        packets(link, 20)
+        now_on(relay, down("silence"))
+        lost(link)
+        clock_peer.first_stamp = 0
+        now_on(relay)
+        with pytest.raises(LinkError, match="was restarted"):
+            link.reconnect(60.0)
 
 
 def test_another_firmware_is_not_taken_for_the_same(clock_peer, lost):
