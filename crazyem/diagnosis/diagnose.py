@@ -106,18 +106,18 @@ def diagnose(
         DataError: a recording cannot be used (no flight, no inputs, too short).
         UsageError: an unknown effect among those wanted.
     """
-    asked = _request_of(recordings, vehicle, held_out, wanted, withhold, strict=strict, say=say)
+    request = _request_of(recordings, vehicle, held_out, wanted, withhold, strict=strict, say=say)
     workers = Workers(jobs)
-    say(f"nominal model of {vehicle.name}: {sum(f.duration for f in asked.flights):.0f} s of flight")
-    chosen = _chosen(asked, workers, say)
+    say(f"nominal model of {vehicle.name}: {sum(f.duration for f in request.flights):.0f} s of flight")
+    chosen = _chosen(request, workers, say)
     data, apart = chosen.data, chosen.apart
     selection, pull = by_place(data, apart, chosen.selection, say)
-    selection, corroborated = _corroborated(data, apart, selection, asked.recordings)
+    selection, corroborated = _corroborated(data, apart, selection, request.recordings)
     selection, balance = by_balance(data, with_exact_torques(data, selection))
-    judges = asked.held_out or asked.recordings
-    selection = without_worse_predictions(data, selection, asked.vehicle, judges, withhold=withhold, say=say)
-    besides = {c.effect for c in asked.besides}
-    selection, balance, unsure = without_undetermined(data, selection, balance, say, besides=besides)
+    judges = request.held_out or request.recordings
+    selection = without_worse_predictions(data, selection, request.vehicle, judges, withhold=withhold, say=say)
+    extra = {c.effect for c in request.extra}
+    selection, balance, unsure = without_undetermined(data, selection, balance, say, extra=extra)
     before, after = _located(data, selection, say)
     place = depends_on_place(data, apart, selection.final)
     remains = unexplained(data, selection, after, apart)
@@ -131,39 +131,39 @@ def diagnose(
     answer = answer_of(
         data, selection, remains, corroborated=corroborated, in_place=_in_place(data, apart, selection), balance=balance
     )
-    if asked.flights[0].inputs.measured:
-        answer, late, remains = _late_rotors(asked, vehicle, answer, remains, left_out)
+    if request.flights[0].inputs.measured:
+        answer, late, remains = _late_rotors(request, vehicle, answer, remains, left_out)
         beside += late
     effects, impossible = determined(strongest_first(answer.effects, beside), selection.final)
-    as_flown = _with_effects(asked.vehicle, selection, [e for e in effects if any(e.name == b.name for b in beside)])
+    as_flown = _with_effects(request.vehicle, selection, [e for e in effects if any(e.name == b.name for b in beside)])
     as_flown = with_its_thrust(as_flown, data, selection.final, selection.accepted)
     as_flown = _restored(
-        with_remaining_trim(chosen.asked.flights, as_flown, remains, workers),
-        asked.vehicle,
-        impossible.keys() - besides,
+        with_remaining_trim(chosen.request.flights, as_flown, remains, workers),
+        request.vehicle,
+        impossible.keys() - extra,
     )
     of_recordings = {e.fitted_as or e.name for e in effects if e.of_recording}
     for name, reason in {**unsure, **impossible}.items():
         left_out[name] = "; ".join(filter(None, (reason, left_out.get(name))))
     return Diagnosis(
         vehicle=vehicle,
-        fitted_vehicle=_restored(as_flown, asked.vehicle, of_recordings),
+        fitted_vehicle=_restored(as_flown, request.vehicle, of_recordings),
         as_flown=as_flown,
-        recordings=tuple(r.path for r in asked.recordings),
-        held_out=tuple(r.path for r in asked.held_out),
+        recordings=tuple(r.path for r in request.recordings),
+        held_out=tuple(r.path for r in request.held_out),
         mismatch=bool(effects) or remains.found,
         before=before,
         after=after,
         effects=effects,
         indistinguishable=tuple(g for g in answer.groups if any(e.name in g for e in effects)),
-        would_separate=_advice(answer.separate, [*asked.recordings, *asked.held_out]),
+        would_separate=_advice(answer.separate, [*request.recordings, *request.held_out]),
         unexplained=remains,
         selection=selection,
         left_out={n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)},
         explained=remains.explained,
         free=left_free(selection.fitted),
-        own=nuisances_of_recordings(chosen.asked.flights, chosen.asked.kept_apart, _strengths(selection)),
-        swapped=asked.swapped,
+        own=nuisances_of_recordings(chosen.request.flights, chosen.request.held_out_flights, _strengths(selection)),
+        swapped=request.swapped,
     )
 
 
@@ -174,19 +174,19 @@ class _Request:
     recordings: Sequence[Recording]
     held_out: Sequence[Recording]
     flights: Sequence[Flight]
-    kept_apart: Sequence[Flight]
+    held_out_flights: Sequence[Flight]
     vehicle: Vehicle
     wanted: Sequence[str]
-    besides: Sequence[Candidate]  # further candidates
+    extra: Sequence[Candidate]  # further candidates
     swapped: bool
 
 
 @dataclass(frozen=True)
 class _Chosen:
-    """The selection: `asked` with the flights as used, the selected effects, all candidates, and the effects that the
+    """The selection: `request` with the flights as used, the selected effects, all candidates, and the effects that the
     flights cannot show, with the reasons."""
 
-    asked: _Request
+    request: _Request
     data: Data
     apart: Data | None
     selection: Selection
@@ -206,29 +206,33 @@ def _request_of(
 ) -> _Request:
     """The flights of the recordings, in one frame; roles are exchanged if the flights to fit only hover."""
     flights = [flight_of(r, vehicle, withhold=withhold) for r in recordings]
-    kept_apart = [flight_of(r, vehicle, withhold=withhold) for r in held_out]
-    swapped = not strict and held_out_roles.swapped(flights, kept_apart)
+    held_out_flights = [flight_of(r, vehicle, withhold=withhold) for r in held_out]
+    swapped = not strict and held_out_roles.swapped(flights, held_out_flights)
     if swapped:
-        flights, kept_apart, recordings, held_out = kept_apart, flights, held_out, recordings
+        flights, held_out_flights, recordings, held_out = held_out_flights, flights, held_out, recordings
         say(held_out_roles.swap_sentence([r.path for r in recordings], [r.path for r in held_out]))
     assumed = with_zero_trim(flights, vehicle)
     untrimmed = assumed is not vehicle and not wanted  # then the trim is a candidate, too
-    flights, kept_apart = with_thrust_scales(*in_mean_frame(*with_common_floor(flights, kept_apart)), assumed)
-    besides = [Candidate(TRIM, (), ("x", "y", "z"))] if untrimmed else []
-    return _Request(recordings, held_out, flights, kept_apart, assumed, wanted, besides, swapped)
+    flights, held_out_flights = with_thrust_scales(
+        *in_mean_frame(*with_common_floor(flights, held_out_flights)), assumed
+    )
+    extra = [Candidate(TRIM, (), ("x", "y", "z"))] if untrimmed else []
+    return _Request(recordings, held_out, flights, held_out_flights, assumed, wanted, extra, swapped)
 
 
-def _chosen(asked: _Request, workers: Workers, say: Say) -> _Chosen:
+def _chosen(request: _Request, workers: Workers, say: Say) -> _Chosen:
     """The selection of effects, with final names and with effects that are needed beside these.
 
     If the result is no physical rigid body (`is_nonphysical`), the selection is repeated without fast effects.
     """
-    chosen = _selected(asked, workers, say)
-    deaf = is_nonphysical(chosen.selection.final, chosen.selection.accepted)
-    if deaf and not any(f.coarse for f in asked.flights):
+    chosen = _selected(request, workers, say)
+    unresponsive = is_nonphysical(chosen.selection.final, chosen.selection.accepted)
+    if unresponsive and not any(f.coarse for f in request.flights):
         say("the turning does not follow the commands as they were recorded: once more without what is fast")
-        flights, kept_apart = ([replace(f, coarse=True) for f in part] for part in (asked.flights, asked.kept_apart))
-        chosen = _selected(replace(asked, flights=flights, kept_apart=kept_apart), workers, say)
+        flights, held_out_flights = (
+            [replace(f, coarse=True) for f in part] for part in (request.flights, request.held_out_flights)
+        )
+        chosen = _selected(replace(request, flights=flights, held_out_flights=held_out_flights), workers, say)
     selection = with_better_rivals(chosen.data, chosen.apart, chosen.selection, say)
     if {c.effect for c in selection.accepted} != {c.effect for c in chosen.selection.accepted}:
         # beside the new effect, others may be significant
@@ -238,10 +242,13 @@ def _chosen(asked: _Request, workers: Workers, say: Say) -> _Chosen:
     return replace(chosen, selection=selection)
 
 
-def _selected(asked: _Request, workers: Workers, say: Say) -> _Chosen:
+def _selected(request: _Request, workers: Workers, say: Say) -> _Chosen:
     """The selection from all candidates that the flights can show."""
-    data, apart = Data(asked.flights, workers), Data(asked.kept_apart, workers) if asked.kept_apart else None
-    vehicle = asked.vehicle
+    data, apart = (
+        Data(request.flights, workers),
+        Data(request.held_out_flights, workers) if request.held_out_flights else None,
+    )
+    vehicle = request.vehicle
     bare = Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, start_noise())
     nominal = nominal_of(data, bare)
     if apart:
@@ -249,13 +256,13 @@ def _selected(asked: _Request, workers: Workers, say: Say) -> _Chosen:
         apart.leave_out_wild(nominal)
         apart.settle(nominal)
     candidates, left_out = candidates_for(
-        nominal, data.signals, measured_speeds=asked.flights[0].inputs.measured, wanted=asked.wanted
+        nominal, data.signals, measured_speeds=request.flights[0].inputs.measured, wanted=request.wanted
     )
-    candidates, left_out = without_unobservable(data, nominal, [*candidates, *asked.besides], left_out)
+    candidates, left_out = without_unobservable(data, nominal, [*candidates, *request.extra], left_out)
     nominal = with_trim_noise(data, nominal)
     begun = steady_selection(data, apart, nominal, candidates, say)
     selection = select(data, nominal, candidates, held_out=apart, begun=begun, say=say)
-    return _Chosen(asked, data, apart, selection, candidates, left_out)
+    return _Chosen(request, data, apart, selection, candidates, left_out)
 
 
 def _located(data: Data, selection: Selection, say: Say) -> tuple[Located, Located]:
@@ -287,16 +294,16 @@ def _in_place(data: Data, apart: Data | None, selection: Selection) -> dict[str,
 
 
 def _late_rotors(
-    asked: _Request, vehicle: Vehicle, answer: Answer, remains: Unexplained, left_out: dict[str, str]
+    request: _Request, vehicle: Vehicle, answer: Answer, remains: Unexplained, left_out: dict[str, str]
 ) -> tuple[Answer, list[Named], Unexplained]:
     """The answer, further effects and the unexplained, from the response of measured rotor speeds to commands."""
-    here, there = answers(asked.recordings, vehicle), answers(asked.held_out, vehicle)
+    here, there = answers(request.recordings, vehicle), answers(request.held_out, vehicle)
     # the body follows the measured speeds, so its effects stay as they are
-    deaf = unresponsive_rotor([*here, *there])
-    remains = remains.with_finding(deaf) if deaf else remains
+    unresponsive = unresponsive_rotor([*here, *there])
+    remains = remains.with_finding(unresponsive) if unresponsive else remains
     if any(e.name == INPUT_DELAY.name for e in answer.effects):
         return answer, [], remains
-    late, alike = late_rotors(here, there, vehicle, asked.wanted, left_out, deaf=deaf is not None)
+    late, alike = late_rotors(here, there, vehicle, request.wanted, left_out, unresponsive=unresponsive is not None)
     separate = (*answer.separate, *(CATALOGUE[n].separates for g in alike for n in g))
     answer = replace(answer, groups=(*answer.groups, *alike), separate=tuple(dict.fromkeys(separate)))
     return answer, late, remains

@@ -108,9 +108,10 @@ def _left_free(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     for name, values in diagnosis.fitted_vehicle.effects.items():
         if name not in named and values != diagnosis.vehicle.effects.get(name):
             effect = CATALOGUE[name]
+            words = f"{effect.description({})}, written into the vehicle"
             found += [
-                {"name": name, "words": f"{effect.said({})}, written into the vehicle", "parameter": p.said,
-                 "value": values[p.name], "sd": None, "unit": p.unit, "expected": p.neutral, "usual": None}
+                {"name": name, "words": words, "parameter": p.description, "value": values[p.name],
+                 "sd": None, "unit": p.unit, "expected": p.neutral, "usual": None}
                 for p in effect.parameters if p.name in values
             ]  # fmt: skip
     return [{k: _number(v) if isinstance(v, float) else v for k, v in entry.items()} for entry in found]
@@ -184,7 +185,9 @@ def _ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 def _words(candidate: Candidate) -> str:
     """Words for a candidate: with its discrete choices, and with its free parameters if there are alternatives."""
     effect = CATALOGUE[candidate.effect]
-    return effect.said({**dict(candidate.fixed), **(dict.fromkeys(candidate.free, 0.0) if effect.alternatives else {})})
+    return effect.description(
+        {**dict(candidate.fixed), **(dict.fromkeys(candidate.free, 0.0) if effect.alternatives else {})}
+    )
 
 
 @dataclass(frozen=True, eq=False)

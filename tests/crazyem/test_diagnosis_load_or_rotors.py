@@ -95,7 +95,7 @@ def test_weighing_is_asked_for_whether_a_load_is_told_apart_or_not() -> None:
     begun = point.with_effects({"payload": {**LOAD.neutral(point), "mass": 0.0039}})
     fitted = refine_base(data, begun, [LOAD], rounds=1, noise=False)
     trial = Trial(LOAD, 50.0, 0.0, 1.0, 1e-9, 46.0, fitted, np.zeros(8), 50.0)
-    weaker = replace(trial, candidate=load_or_rotors.WEAKER, tuned=4.0)
+    weaker = replace(trial, candidate=load_or_rotors.WEAKER, parameter_cost=4.0)
     selection = Selection(point, fitted.point, (Step((trial,), trial),), (LOAD,), fitted, 1)
     for value, group in ((30.0, ()), (49.0, (("payload", "thrust_scale", "center_of_mass"),))):
         pair = (trial, replace(weaker, value=value))

@@ -181,10 +181,13 @@ def test_what_no_flight_tells_costs_a_nat_and_no_more() -> None:
 def test_a_load_that_must_sit_in_the_middle_is_told_from_weak_rotors() -> None:
     """As likely with four numbers as with one, but two of them must be 0 within 0.1 mm of some 10: that it happens to
     sit there costs more than another nat for each."""
-    weak, load = replace(trial("thrust_scale", "s", 100.0), tuned=5.0), trial("payload", "mxyz", 100.5, scatter=0.1)
-    assert not distinguishable(weak, replace(load, tuned=None, value=103.5))
+    weak, load = (
+        replace(trial("thrust_scale", "s", 100.0), parameter_cost=5.0),
+        trial("payload", "mxyz", 100.5, scatter=0.1),
+    )
+    assert not distinguishable(weak, replace(load, parameter_cost=None, value=103.5))
     scaled = np.diag(np.square([1e-5, 1e-4, 1e-4, 1.0]))
     at = Candidate("payload", (), ("mass", "x", "y", "z"))
     cost = occam_cost([at], posterior_covariance([at], np.linalg.inv(scaled)))
     assert cost == pytest.approx(np.log(2.5e-3 / 1e-5) + 2 * np.log(1e-2 / 1e-4), abs=0.01)
-    assert distinguishable(weak, replace(load, tuned=cost))
+    assert distinguishable(weak, replace(load, parameter_cost=cost))

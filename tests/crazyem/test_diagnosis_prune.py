@@ -323,8 +323,8 @@ def test_heavy_rotors_are_fitted_beside_a_damping_from_where_they_are_heavy():
     assert sum(t.candidate.effect == "rotor_inertia" for t, _ in shortlist(found)) == 1
 
 
-@pytest.mark.parametrize(("left", "doubted"), [(False, frozenset()), (True, frozenset({"linear_drag"}))])
-def test_an_effect_that_leaves_no_hump_is_not_doubted(monkeypatch, left: bool, doubted: frozenset[str]) -> None:
+@pytest.mark.parametrize(("left", "doubtful"), [(False, frozenset()), (True, frozenset({"linear_drag"}))])
+def test_an_effect_that_leaves_no_hump_is_not_doubted(monkeypatch, left: bool, doubtful: frozenset[str]) -> None:
     """Beside the hump the effect is of another size; that counts only where a hump stays once the effect is there."""
     hump = [SimpleNamespace(axis=0, frequency=4.0)]
     drone = POINT.with_effects({"linear_drag": {"x": 0.02, "y": 0.02, "z": 0.02}})
@@ -338,4 +338,4 @@ def test_an_effect_that_leaves_no_hump_is_not_doubted(monkeypatch, left: bool, d
     monkeypatch.setattr(prune, "off_peak_gram", lambda data, point, columns, found: gram(-1.0))
     data = SimpleNamespace(models=[None], gram=lambda point, columns: gram(0.0))
     fitted = SimpleNamespace(point=drone, precision=np.zeros(3))
-    assert prune.vibration_look_alikes(data, POINT, fitted, [DRAG], lambda text: None) == doubted  # type: ignore[arg-type]
+    assert prune.vibration_look_alikes(data, POINT, fitted, [DRAG], lambda text: None) == doubtful  # type: ignore[arg-type]

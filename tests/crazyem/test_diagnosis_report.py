@@ -326,9 +326,9 @@ def test_whatever_is_accused_is_pictured_the_strongest_first() -> None:
 def test_effects_and_parameters_have_words_without_program_text() -> None:
     for effect in CATALOGUE.values():
         values = {p.name: (p.chosen or (1.0,))[0] for p in effect.parameters}
-        for text in (effect.said({}), effect.said(values), *(p.said for p in effect.parameters)):
+        for text in (effect.description({}), effect.description(values), *(p.description for p in effect.parameters)):
             assert re.fullmatch(r"[a-zA-Z0-9. ]+", text), text
-    assert CATALOGUE["measurement_delay"].said({"delay": 0.01, "streams": ("state", "gyro")}) == (
+    assert CATALOGUE["measurement_delay"].description({"delay": 0.01, "streams": ("state", "gyro")}) == (
         "measurement delay of the state estimate and gyro"
     )
 

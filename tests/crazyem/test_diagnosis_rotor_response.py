@@ -192,19 +192,19 @@ def behind(time, wanted, *, lag):
     return out
 
 
-@pytest.mark.parametrize(("lag", "deaf"), [(0.05, False), (0.08, False), (0.08, True)])
+@pytest.mark.parametrize(("lag", "unresponsive"), [(0.05, False), (0.08, False), (0.08, True)])
 @pytest.mark.parametrize("held_out", [False, True])
-def test_a_late_rotor_is_as_sure_as_what_speaks_for_it(lag, held_out, deaf):
+def test_a_late_rotor_is_as_sure_as_what_speaks_for_it(lag, held_out, unresponsive):
     """One rotor of four that sticks makes all of them look late."""
     slow = Answer(np.array([lag, 0.0]), np.diag([1e-6, 1e-6]), np.ones((4, 1000)) * 1e-4, (1.0, 9.0))
-    found, groups = late_rotors([slow], [slow] if held_out else [], ROTORS, (), {}, deaf=deaf)
+    found, groups = late_rotors([slow], [slow] if held_out else [], ROTORS, (), {}, unresponsive=unresponsive)
     assert groups == ()
     assert [e.name for e in found] == ["motor_lag"]
     odds = found[0].log_odds
     assert odds is not None
     most = float(expit(odds))
     assert most <= CONFIDENCE.max_probability
-    assert found[0].confidence == pytest.approx(min(most, CONFIDENCE.doubtful) if deaf else most)
+    assert found[0].confidence == pytest.approx(min(most, CONFIDENCE.doubtful) if unresponsive else most)
 
 
 @pytest.mark.slow

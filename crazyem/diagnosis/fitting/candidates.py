@@ -132,7 +132,7 @@ class OfRecordings(Candidate):
     @property
     def label(self) -> str:
         """For people."""
-        return f"{self._shared.said({})} of each recording"
+        return f"{self._shared.description({})} of each recording"
 
     @property
     def _shared(self) -> Effect:
@@ -142,7 +142,7 @@ class OfRecordings(Candidate):
         """The deviation of one parameter in one recording."""
         recording, _, own = name.rpartition("/")
         p = next(p for p in self._shared.parameters if p.name == own)
-        words, middle = f"{p.said} of {recording.rpartition('/')[2]}", float(p.neutral)
+        words, middle = f"{p.description} of {recording.rpartition('/')[2]}", float(p.neutral)
         return replace(p, name=name, words=words, neutral=0.0, low=p.low - middle, high=p.high - middle)
 
     def neutral(self, point: Point) -> dict[str, Any]:

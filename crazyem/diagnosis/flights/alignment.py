@@ -49,7 +49,7 @@ class Alignment:
         at = np.searchsorted(self.ends, time, "right") - 1
         return np.where(at >= 0, self.running[np.maximum(at, 0)], 0.0)
 
-    def said(self) -> str:
+    def description(self) -> str:
         """For people."""
         return (
             f"rotor speeds act {1e3 * self.delay:+.1f} ms after their stamps in this recording (roll "

@@ -38,7 +38,7 @@ class Frame:
     pitch: float
     sd: tuple[float, float]
 
-    def said(self) -> str:
+    def description(self) -> str:
         """For people."""
         return (
             f"the pose frame of this recording is tilted by {1e3 * self.roll:+.1f} mrad in roll and "

@@ -104,7 +104,7 @@ def inputs_of(
     late = RECORDINGS.command_delay if name in _SAMPLED else alignment.delay if alignment is not None else 0.0
     if name in _SAMPLED and "attitude" in recording.signals:
         late -= RECORDINGS.rate_delay
-    notices = found.notices if alignment is None else (*found.notices, alignment.said())
+    notices = found.notices if alignment is None else (*found.notices, alignment.description())
     rotor = RotorInput(
         found.time,
         np.ascontiguousarray(found.thrust),

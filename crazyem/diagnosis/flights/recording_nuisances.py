@@ -72,7 +72,7 @@ def nuisances_of_recordings(
 def _nuisances_of(flight: Flight, held_out: bool, strength: float | None) -> RecordingNuisances:
     notices = [*flight.notices]
     if flight.frame:
-        notices.append(flight.frame.said())
+        notices.append(flight.frame.description())
     if strength is not None and abs(strength - 1.0) > RECORDINGS.thrust_difference:
         notices.append(f"the thrust of this recording differs by {100.0 * (strength - 1.0):+.1f} % from the vehicle's")
     return RecordingNuisances(flight.name, held_out, flight.alignment, flight.frame, strength, tuple(notices))

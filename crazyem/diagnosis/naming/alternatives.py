@@ -69,7 +69,7 @@ def _reselected(
         starts.append((point, _in_place(selection.accepted, mine, rival.candidate)))
     found = data.workers.map(lambda start: refitted(data, held_out, *start), starts)
     tried = [
-        replace(trial, candidate=c, value=value, blocks=blocks, tuned=occam_cost_of(c, accepted, known))
+        replace(trial, candidate=c, value=value, blocks=blocks, parameter_cost=occam_cost_of(c, accepted, known))
         for trial, c, (_, accepted), (value, blocks, known) in zip(
             [step.taken, *others], [mine, *(t.candidate for t in others)], starts, found, strict=True
         )

@@ -83,10 +83,10 @@ def answer_of(
         there *= structure_factor(against, step.taken.held_out) if step.taken.log_odds is None else 1.0
         confidence = there * preferred(step.taken, rivals)
         confidence /= 1.0 + sum(float(np.exp(-nats)) for nats in steady.values())
-        doubted = candidate.effect in selection.doubted
+        doubtful = candidate.effect in selection.doubtful
         by_day = _by_the_day(candidate, point, balance)
         none_of_it = wald(away, covariance, gram, used) if by_day is None else by_day[1]
-        if doubted or none_of_it > CONFIDENCE.neutral_p:
+        if doubtful or none_of_it > CONFIDENCE.neutral_p:
             confidence = min(confidence, CONFIDENCE.doubtful)
         p_value = min(1.0, step.taken.p_value * max(1, selection.tried))
         # late inputs and late measurements are one model: fitted as the former, named by corroboration
@@ -98,7 +98,7 @@ def answer_of(
         named = Named(name, label, parameters, chosen, step.taken.held_out, p_value, confidence, candidate.effect, odds)
         found.append(((-there, -step.taken.evidence), named))
 
-        if doubted:
+        if doubtful:
             separate.append(SHAKES)
         equal = [
             *(t.candidate.effect for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}),

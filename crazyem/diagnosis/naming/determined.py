@@ -49,7 +49,7 @@ def not_determined(candidate: Candidate, parameters: Mapping[str, Value], point:
     neutral = candidate.neutral(point)
     for name, value in parameters.items():
         low, high = candidate.range_of(name)
-        said = candidate.parameter(name).said
+        said = candidate.parameter(name).description
         if not all(map(math.isfinite, (value.value, value.sd, *value.ci95))):
             return f"not determined: its {said} has no finite size or interval"
         if not low <= value.value <= high:
@@ -62,7 +62,7 @@ def not_determined(candidate: Candidate, parameters: Mapping[str, Value], point:
     saying = {n: v for n, v in parameters.items() if n == amplitude} or parameters
     if saying and all(v.ci95[0] <= neutral[n] <= v.ci95[1] for n, v in saying.items()):
         which = ", ".join(
-            f"{candidate.parameter(n).said} {v.ci95[0]:.3g} to {v.ci95[1]:.3g} {v.unit}".rstrip()
+            f"{candidate.parameter(n).description} {v.ci95[0]:.3g} to {v.ci95[1]:.3g} {v.unit}".rstrip()
             for n, v in saying.items()
         )
         return f"not determined: what is found is no surer than that there is none of it (95 %: {which})"
@@ -93,28 +93,28 @@ def without_undetermined(
     balance: Balance | None,
     say: Callable[[str], None],
     *,
-    besides: Collection[str] = (),
+    extra: Collection[str] = (),
 ) -> tuple[Selection, Balance | None, dict[str, str]]:
     """The selection fitted again without undetermined effects, the weakest first; its balance; names and reasons.
 
     If only some numbers of an effect are at an end (the height of a load), these are held at neutral, and the others
-    may be determined. Effects in `besides`, which are written whatever their size (a trim), stay in the selection.
+    may be determined. Effects in `extra`, which are written whatever their size (a trim), stay in the selection.
     """
     gone: dict[str, str] = {}
     while True:
         numbers = numbers_of(data, selection, balance)
         taken = [s.taken for s in selection.steps if s.taken]
-        doubted = [
+        doubtful = [
             (trial.evidence, candidate, found, reason)
             for trial, candidate, found, order in zip(
                 taken, selection.accepted, numbers, selection.orders(), strict=True
             )
-            if candidate.effect not in besides
+            if candidate.effect not in extra
             and (reason := not_determined(candidate, found, selection.final) or improbable(trial.presence(order)))
         ]
-        if not doubted:
+        if not doubtful:
             return selection, balance, gone
-        _, candidate, found, reason = min(doubted, key=lambda entry: entry[0])
+        _, candidate, found, reason = min(doubtful, key=lambda entry: entry[0])
         fewer = _without_ends(candidate, found, selection.final)
         if fewer is not None:
             say(f"  held at none, as it is at the end of what is possible: {set(candidate.free) - set(fewer.free)}")

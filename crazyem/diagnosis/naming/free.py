@@ -47,11 +47,11 @@ def left_free(fitted: Fitted) -> tuple[Free, ...]:
     at, found = sum(len(c.free) for c in fitted.candidates), []
     for candidate in fitted.nuisances:
         values, expected = candidate.values(fitted.point), candidate.neutral(fitted.point)
-        words = CATALOGUE[candidate.effect].said({}) if candidate.effect in CATALOGUE else candidate.label
+        words = CATALOGUE[candidate.effect].description({}) if candidate.effect in CATALOGUE else candidate.label
         for name in candidate.free:
             p, sd = candidate.parameter(name), max(variance[at], 0.0) ** 0.5
             usual = fitted.precision[at] ** -0.5 if fitted.precision[at] > 0.0 else math.inf
             numbers = [float(x) for x in (values[name], sd, expected[name], usual)]
-            found.append(Free(candidate.effect, words, p.said, p.unit, *numbers))
+            found.append(Free(candidate.effect, words, p.description, p.unit, *numbers))
             at += 1
     return tuple(found)

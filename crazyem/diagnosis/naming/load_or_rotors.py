@@ -47,7 +47,9 @@ def load_against_rotors(data: Data, held_out: Data | None, selection: Selection)
         others = [_substitute_trial(data, held_out, selection, most[:n]) for n in range(1, len(most) + 1)]
     except DivergedError:
         return None
-    taken = replace(step.taken, value=value, blocks=blocks, tuned=occam_cost_of(load, selection.accepted, known))
+    taken = replace(
+        step.taken, value=value, blocks=blocks, parameter_cost=occam_cost_of(load, selection.accepted, known)
+    )
     return taken, max(others, key=lambda t: t.worth)
 
 
@@ -62,9 +64,9 @@ def _substitute_trial(data: Data, held_out: Data | None, selection: Selection, i
     return _comparison_trial(Candidate(WEAKER.effect, (), free), value, blocks, float(cost))
 
 
-def _comparison_trial(candidate: Candidate, value: float, blocks: NDArray, tuned: float) -> Trial:
+def _comparison_trial(candidate: Candidate, value: float, blocks: NDArray, parameter_cost: float) -> Trial:
     """A trial of effects in the place of another effect, used for the comparison with it alone."""
-    return Trial(candidate, 0.0, 0.0, 1.0, 0.0, 0.0, blocks=blocks, value=value, tuned=tuned)
+    return Trial(candidate, 0.0, 0.0, 1.0, 0.0, 0.0, blocks=blocks, value=value, parameter_cost=parameter_cost)
 
 
 def rotors_against_load(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
@@ -87,7 +89,9 @@ def rotors_against_load(data: Data, held_out: Data | None, selection: Selection)
         other, others, known_load = refitted(data, held_out, loaded, [*rest, HEAVIER])
     except DivergedError:
         return None
-    taken = replace(step.taken, value=value, blocks=blocks, tuned=occam_cost_of(weaker, selection.accepted, known))
+    taken = replace(
+        step.taken, value=value, blocks=blocks, parameter_cost=occam_cost_of(weaker, selection.accepted, known)
+    )
     return taken, _comparison_trial(HEAVIER, other, others, occam_cost_of(HEAVIER, [*rest, HEAVIER], known_load))
 
 

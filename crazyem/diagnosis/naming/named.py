@@ -49,7 +49,7 @@ class Named:
     def words(self) -> str:
         """The effect in words, with its choices."""
         values = {**self.chosen, **{n: v.value for n, v in self.parameters.items()}}
-        return CATALOGUE[self.name].said(values)
+        return CATALOGUE[self.name].description(values)
 
     @property
     def of_recording(self) -> bool:

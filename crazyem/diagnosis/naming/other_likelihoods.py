@@ -87,11 +87,11 @@ def late_rotors(
     wanted: Sequence[str],
     left_out: dict[str, str],
     *,
-    deaf: bool = False,
+    unresponsive: bool = False,
 ) -> tuple[list[Named], tuple[tuple[str, ...], ...]]:
     """Lag and delay of rotors with measured speeds, and the group of both where they are look-alikes.
 
-    A rotor that ignores its command (`deaf`) makes all four look late or prompt, so neither effect is sure.
+    A rotor that ignores its command (`unresponsive`) makes all four look late or prompt, so neither effect is sure.
     """
     found = rotor_response.response(answers)
     if found is None:
@@ -107,6 +107,6 @@ def late_rotors(
         p_value = float(np.exp(-min(late.nats, 700.0)))
         there = presence_by_odds(min(late.held_out, late.nats))
         sure = there * (0.5 if late.alike else 1.0)
-        sure = min(sure, CONFIDENCE.doubtful) if deaf else sure
+        sure = min(sure, CONFIDENCE.doubtful) if unresponsive else sure
         named.append(Named(name, name, values, {}, late.held_out, p_value, sure, log_odds=float(logit(there))))
     return named, ((MOTOR_LAG.name, INPUT_DELAY.name),) if late.alike else ()

@@ -34,12 +34,12 @@ def pruned(
     fitted, accepted, steps = selection.fitted, list(selection.accepted), list(selection.steps)
     held_out = held_out and held_out_twin(held_out, fitted.point, accepted)
     fitted, accepted, steps = backward_elimination(data, fitted, accepted, steps, held_out, say)
-    doubted: frozenset[str] = frozenset()
+    doubtful: frozenset[str] = frozenset()
     if TRIM not in selection.final.vehicle.effects:  # both judge by the scatter of blocks (see `by_gain`)
         fitted, accepted, steps = without_noise_look_alikes(data, fitted, accepted, steps, held_out, say)
-        doubted = vibration_look_alikes(data, nominal, fitted, accepted, say)
+        doubtful = vibration_look_alikes(data, nominal, fitted, accepted, say)
     return replace(
-        selection, final=fitted.point, steps=tuple(steps), accepted=tuple(accepted), fitted=fitted, doubted=doubted
+        selection, final=fitted.point, steps=tuple(steps), accepted=tuple(accepted), fitted=fitted, doubtful=doubtful
     )
 
 
@@ -205,7 +205,7 @@ def vibration_look_alikes(
     )
     information = beside[0].total(range(beside[0].size))[1]
     taken = used(information, information + np.diag(fitted.precision))  # priors use no degrees of freedom
-    doubted, offset = [], 0
+    doubtful, offset = [], 0
     for c in accepted:
         at = slice(offset, offset + len(c.free))
         offset = at.stop
@@ -214,8 +214,8 @@ def vibration_look_alikes(
         share = float(apart @ np.linalg.pinv(covariance) @ apart) / float(size @ np.linalg.pinv(covariance) @ size)
         if share > SELECTION.size_difference**2 and wald(apart, covariance, beside[0], taken) < SELECTION.hausman_p:
             say(f"  it has another size without the vibration: {c.label}")
-            doubted.append(c.effect)
-    return frozenset(doubted)
+            doubtful.append(c.effect)
+    return frozenset(doubtful)
 
 
 def left_out(

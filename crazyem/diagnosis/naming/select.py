@@ -217,7 +217,7 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
     else:
         covariance = accepted_covariance(fit, mine)
     k, offset = len(trial.candidate.free), sum(len(c.free) for c in basis.accepted)
-    tuned = occam_cost([trial.candidate], covariance[-k:, -k:])
+    parameter_cost = occam_cost([trial.candidate], covariance[-k:, -k:])
     trial = replace(trial, dispersion=dispersion_of(fit, k, offset=offset))
     wald_p = significance(fit, k, offset=offset)
     wald_p = p_value_by_gain(fit.point, gain / trial.dispersion, k, len(fit.gram.score), wald_p)
@@ -228,7 +228,7 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
     )
     sure = sure if exceeds_limit(fit.point, trial.candidate, data) else 1.0
     judged = replace(trial, gain=gain, held_out=held, p_value=sure, fitted=fit)
-    return replace(judged, blocks=blocks, value=value, recording=recording, tuned=tuned)
+    return replace(judged, blocks=blocks, value=value, recording=recording, parameter_cost=parameter_cost)
 
 
 def compatible(effect: str, found: set[str]) -> bool:

@@ -51,7 +51,7 @@ class Trial:
     blocks: NDArray = field(default_factory=lambda: np.zeros(0))
     value: float = 0.0
     recording: NDArray = field(default_factory=lambda: np.zeros(0, int))
-    tuned: float | None = None
+    parameter_cost: float | None = None
     log_odds: float | None = None
     size: Mapping[str, float] = field(default_factory=dict)
     other_evidence: float = 0.0
@@ -68,7 +68,7 @@ class Trial:
     @property
     def worth(self) -> float:
         """Log evidence, by which two trials are compared: the gain on all blocks less the cost of parameters [nats]."""
-        return self.value - (len(self.candidate.free) if self.tuned is None else self.tuned)
+        return self.value - (len(self.candidate.free) if self.parameter_cost is None else self.parameter_cost)
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Selection:
     accepted: tuple[Candidate, ...]
     fitted: Fitted
     tried: int
-    doubted: frozenset[str] = frozenset()
+    doubtful: frozenset[str] = frozenset()
 
     def orders(self) -> list[int]:
         """The rank of each selected effect in the order of their selection (from 1); a trim is not counted."""

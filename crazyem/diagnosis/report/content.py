@@ -132,7 +132,7 @@ def _parameter(effect: str, name: str, found: Mapping[str, Any]) -> tuple[Any, .
     value, unit, sd, ends = (found.get(k) for k in ("value", "unit", "sd", "ci95"))
     unit = "" if unit is None else unit
     bar = _bar(number(value), [number(e) for e in items(ends)], number(known.neutral) if known else None)
-    words = known.said if known else spaced(name)
+    words = known.description if known else spaced(name)
     return words, Cell(quantity(value, unit, sd), "strong"), span(ends, value, unit, sd), bar or ""
 
 

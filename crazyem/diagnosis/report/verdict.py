@@ -95,7 +95,7 @@ def spaced(name: Any) -> str:
 
 def effect_words(name: Any) -> str:
     """An effect in words, by its name."""
-    return CATALOGUE[str(name)].said({}) if str(name) in CATALOGUE else spaced(name)
+    return CATALOGUE[str(name)].description({}) if str(name) in CATALOGUE else spaced(name)
 
 
 def words_of(effect: Mapping[str, Any]) -> str:
@@ -104,7 +104,7 @@ def words_of(effect: Mapping[str, Any]) -> str:
         return spaced(effect.get("words") or effect.get("name", ""))
     found = table(effect.get("parameters"))
     values = {str(n): table(v).get("value") if isinstance(v, Mapping) else v for n, v in found.items()}
-    return CATALOGUE[str(effect["name"])].said(values)
+    return CATALOGUE[str(effect["name"])].description(values)
 
 
 def sizes_of(effect: Mapping[str, Any]) -> str:

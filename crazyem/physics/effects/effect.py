@@ -58,7 +58,7 @@ class Parameter:
     remark: str = ""
 
     @property
-    def said(self) -> str:
+    def description(self) -> str:
         """Name for people."""
         return self.words or self.name.replace("_", " ")
 
@@ -325,7 +325,7 @@ class Effect:
     about: tuple[str, ...] = ()
     controllers: bool = False
 
-    def said(self, values: Values) -> str:
+    def description(self, values: Values) -> str:
         """The effect in words, with the values that specify it: "rotor fault of rotor 3"."""
         named = [p.phrase_of(values[p.name]) for p in self.parameters if p.phrase and values.get(p.name) is not None]
         return " ".join([self.words or self.name.replace("_", " "), *named])
