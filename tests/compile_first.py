@@ -55,7 +55,7 @@ OF_EFFECTS = (
     "physics_effects_bodies.py::test_swing_of_a_small_angle_has_the_textbook_period_and_dies_in_twenty_seconds",
     "physics_effects_bodies.py::test_swing_knows_no_later_row_and_starts_anew_after_a_gap",
     "diagnosis_onboard_filter.py::test_what_a_force_changes_in_the_velocity_that_is_shown_is_a_difference_of_likelihoods",
-    "estimation_marginal.py::test_nothing_is_integrated_where_the_noise_is_known",
+    "estimation_marginal.py::test_nothing_is_integrated_where_the_noise_is",
     "monitoring_detector.py::test_every_column_of_the_body_is_the_derivative_of_the_model",
 )  # fmt: skip
 

@@ -172,11 +172,8 @@ def trajectory_maker(words: Sequence[str], duration: float) -> TrajectoryMaker:
 
 def duration_note(words: Sequence[str], duration: float) -> str:
     """One line if the duration of the trajectory differs from the requested one, else ""."""
-    made = (
-        duration
-        if words[0] in ("waypoints", "plan")
-        else _made(words[0], (0.0, 0.0, DEFAULT_HEIGHT), 0.0, duration).duration
-    )
+    known = words[0] in _MAKERS
+    made = _made(words[0], (0.0, 0.0, DEFAULT_HEIGHT), 0.0, duration).duration if known else duration
     if math.isclose(made, duration):
         return ""
     return f"{words[0]} flies whole periods and ends where it began: {made:g} s instead of {duration:g} s"
