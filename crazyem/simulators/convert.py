@@ -15,7 +15,7 @@ from crazyem.simulators.cost import HORIZON, errors_after, flown, reference_flig
 from crazyem.simulators.fields import Contradiction, Format, SimulatorFile, read, write
 from crazyem.simulators.formats.rotorpy import ROTORPY, ROTORPY_JSON
 from crazyem.simulators.plausible import impossible, objection
-from crazyem.simulators.registry import OWN, format_named, format_of
+from crazyem.simulators.registry import FORMATS, OWN, format_named, format_of
 from crazyem.vehicle import Vehicle, preset_names
 
 # Quantities that a file holds or omits together: words for people, and the quantities.
@@ -274,3 +274,8 @@ def same(first: Constants, second: Constants, quantities: tuple[str, ...]) -> bo
     # products of inertia are compared with the moments of inertia: products alone may all be near 0
     scale = max(scale, 1e-6 * first.or_("inertia_xx", 0.0)) if quantities[0] == "inertia_xy" else scale
     return all(abs(a - b) <= max(HELD * scale, floor) for a, b in pairs)
+
+
+def known_formats() -> dict[str, str]:
+    """Name and description of every format."""
+    return {n: f.words for n, f in FORMATS.items() if n != ROTORPY_JSON.name}
