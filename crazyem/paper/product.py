@@ -117,14 +117,14 @@ def product_offline(
     begin = time.perf_counter()
     estimate = estimator.finish()
     seconds = time.perf_counter() - begin
-    trace = np.array([theta[:4] for theta in estimator.trace])
+    trace = np.array([theta[:4] for theta in estimator.trace]).reshape(-1, 4)  # empty for a window of few samples
     said = [estimate[name] for name in PARAMETERS]
     return Fit(
         value=np.array([p.value for p in said]),
         sd=np.array([p.sd for p in said]),
         ci95=np.array([p.ci95 for p in said]),
         converged=estimate.converged,
-        passes=len(trace) - 1,
+        passes=max(len(trace) - 1, 0),
         history=trace,
         seconds=seconds,
     )
