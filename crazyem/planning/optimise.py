@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from crazyem.control.harmonics import Axis, Harmonics
+from crazyem.control.plan_file import HIGHEST_FREQUENCY
 from crazyem.planning.closed_loop import Flown, fly
 from crazyem.planning.limits import Limits
 from crazyem.vehicle import Vehicle
@@ -46,7 +47,10 @@ class Found:
 
 
 def lines_of(duration: float) -> list[list[tuple[float, ...]]]:
-    """Frequencies [Hz] by axis (x, y, z, yaw) and band, all different, with whole cycles in `duration` [s]."""
+    """Frequencies [Hz] by axis (x, y, z, yaw) and band, all different, with whole cycles in `duration` [s].
+
+    In a short manoeuvre a band may have one line: a second one would be faster than `HIGHEST_FREQUENCY`.
+    """
     base = 1.0 / duration
     taken: set[int] = set()
     found: list[list[tuple[float, ...]]] = [[] for _ in range(4)]
@@ -59,7 +63,7 @@ def lines_of(duration: float) -> list[list[tuple[float, ...]]]:
                 taken.add(cycles)
                 if line == 0:
                     found[axis].append((cycles * base,))
-                else:
+                elif cycles * base <= HIGHEST_FREQUENCY:
                     found[axis][-1] = (*found[axis][-1], cycles * base)
             if begin:
                 cycles += max(1, round(0.25 * begin / base))  # the second line of a band is a quarter higher
@@ -104,7 +108,7 @@ class Family:
                 at = a * len(BANDS) + b
                 rms = math.sqrt(max(float(point[at]), 0.0)) * float(self.full[at])
                 for f, phase in zip(band, phases[b]) if rms > 0.0 else ():
-                    size = rms * math.sqrt(2.0 / LINES) / (2.0 * math.pi * f) ** 2
+                    size = rms * math.sqrt(2.0 / len(band)) / (2.0 * math.pi * f) ** 2
                     frequency.append(f)
                     cosine.append(size * math.cos(phase))
                     sine.append(size * math.sin(phase))

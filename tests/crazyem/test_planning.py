@@ -15,7 +15,7 @@ from crazyem import cli
 from crazyem.api.planning import look_alikes, noise_of, plan, plan_commands
 from crazyem.control.harmonics import Axis, Harmonics
 from crazyem.control.named_trajectories import duration_note, trajectory_maker
-from crazyem.control.plan_file import PlanFile, plan_toml, plan_trajectory, read_plan
+from crazyem.control.plan_file import HIGHEST_FREQUENCY, PlanFile, plan_toml, plan_trajectory, read_plan
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.estimation.inflation import steady_gain
 from crazyem.estimation.model import Noise
@@ -64,10 +64,12 @@ def test_a_plan_turns_with_the_heading() -> None:
     assert other.yaw - math.pi / 2 == pytest.approx(one.yaw)
 
 
-def test_no_two_axes_share_a_line() -> None:
-    for duration in (3.0, 5.0, 10.0, 30.0):
+def test_no_two_axes_share_a_line_and_a_plan_file_may_have_all() -> None:
+    for duration in (3.0, 3.1, 3.2, 3.3, 5.0, 10.0, 30.0):
+        assert all(band for axis in lines_of(duration) for band in axis)
         lines = [f for axis in lines_of(duration) for band in axis for f in band]
         assert len(set(lines)) == len(lines)
+        assert max(lines) <= HIGHEST_FREQUENCY
         assert np.allclose(np.array(lines) * duration, np.round(np.array(lines) * duration))
 
 
