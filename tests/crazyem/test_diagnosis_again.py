@@ -62,7 +62,7 @@ def test_what_went_on_to_its_end_is_taken_back_and_the_selection_goes_on(monkeyp
     """As a slope of the thrust curve did, in the fit with all that is free: a thrust that does not heed its command."""
     data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02), thrust=(0.9,) * 4), seconds=10.0), DRONE)])
     point = nominal(data, Point(DRONE, {}, start_noise()))
-    real, said = selecting.refine_anew, []
+    real, said = selecting.refine_with_memory, []
     end = THRUST.range_of("scale")[0]
 
     def too_far(data, point, accepted, **more):

@@ -67,7 +67,7 @@ class Flight:
         signals: names of the measured signals.
         fused: whether the attitude, or without one the velocity, comes from a filter on board.
         levelled: whether the voltage is not recorded, but chosen so that the first thrust carries the weight.
-        coarse: whether the recorded commands do not explain the rotation (see `nuisances.unlike_a_body`).
+        coarse: whether the recorded commands do not explain the rotation (see `nuisances.is_nonphysical`).
         differs: whether each of several recordings has a thrust scale of its own (see `model.OWN`).
         alignment: delay of measured rotor speeds, already corrected; None where unknown.
         frame: tilt of the pose frame against other recordings, already corrected; None if equal.

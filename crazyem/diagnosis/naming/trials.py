@@ -35,7 +35,7 @@ class Trial:
         value: the gain on all these blocks [nats] if the candidate were fitted to all of them; the priors of the
             nuisances are part of it.
         recording: (b,) int, the recording of each block.
-        tuned: nats that the width of its prior costs (`evidence.tuning`); None: one nat a parameter.
+        tuned: nats that the width of its prior costs (`evidence.occam_cost`); None: one nat a parameter.
         log_odds: log posterior odds of the effect, where the balance of the flights gives them (`steady_odds.py`).
         size: the parameters that these odds are of.
         other_evidence: nats of signals that the filter does not use.

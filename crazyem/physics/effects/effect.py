@@ -71,7 +71,7 @@ class Parameter:
 
     @property
     def width(self) -> float:
-        """Typical distance from neutral: the width of the prior in the cost of a parameter (`evidence.tuning`)."""
+        """Typical distance from neutral: the width of the prior in the cost of a parameter (`evidence.occam_cost`)."""
         return self.usual or 5.0 * self.scale
 
 
