@@ -2,7 +2,8 @@
 
     python -m benchmarks.ablation selection.gain_share=0.3 diagnose FLIGHT --vehicle cf2
 
-As `--command` of `benchmarks.concealed diagnose` it needs this folder in PYTHONPATH.
+As `--command` of `benchmarks.concealed diagnose`, with `diagnose` as its last word, it needs the project's folder in
+PYTHONPATH.
 """
 
 import sys

@@ -28,7 +28,7 @@ def recordings_of(
 
 
 def vehicle_of(given: VehicleLike | None, recording: Recording | None = None) -> Vehicle:
-    """The given vehicle, preset or file; None: the vehicle of the recording (see `doctor.thrust.vehicle_for`).
+    """The given vehicle, preset or file; None: the vehicle of the recording (see `recordings.thrust.vehicle_for`).
 
     Raises:
         UsageError: no such vehicle. FileFormatError: the file is no vehicle.

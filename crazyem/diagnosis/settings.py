@@ -1,9 +1,8 @@
-"""All numbers of the diagnosis that are chosen, in one frozen table: value, unit, source.
+"""The chosen numbers of the diagnosis, in one frozen table: value, unit and meaning, and a source where one exists.
 
-A section holds the numbers of one stage. "Assumed" means that no data determine the number; a size that is assumed by
-order of magnitude only changes how long a search takes or how sharp a picture is. Sizes of an effect, its prior and
-its physical range stand with the effect (`physics/effects`). Constants of equations, firmware and formats are no
-settings and stand where they are used.
+A section holds the numbers of one stage. A number without a source, data or a reason is assumed, as one that says so.
+Sizes of an effect, its prior and its physical range stand with the effect (`physics/effects`). Constants of equations,
+firmware and formats, and guards of numerical methods, are no settings and stand where they are used.
 
 "Simulated" means flights of the simulated firmware; seeds are those of `benchmarks/concealed`.
 """

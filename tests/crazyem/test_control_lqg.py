@@ -19,17 +19,55 @@ GAINS = np.array([4.0, 3.0, 40.0, 20.0])
 weights = st.floats(0.01, 1000.0)
 
 
-@given(position=weights, velocity=weights, dt=st.floats(0.001, 0.05))
+def double_integrator(dt):
+    return np.array([[1.0, dt], [0.0, 1.0]]), np.array([[0.5 * dt * dt], [dt]])
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.005, 0.05])
+@pytest.mark.parametrize(("position", "velocity"), [(16.0, 4.0), (1.0, 1.0), (400.0, 0.1)])
 def test_gains_are_those_of_the_riccati_equation(dt, position, velocity):
-    a, b = np.array([[1.0, dt], [0.0, 1.0]]), np.array([[0.5 * dt * dt], [dt]])
+    a, b = double_integrator(dt)
     p = solve_discrete_are(a, b, np.diag([position, velocity]), np.eye(1))
     wanted = np.linalg.solve(np.eye(1) + b.T @ p @ b, b.T @ p @ a)[0]
-    assert position_gains(dt=dt, position_weight=position, velocity_weight=velocity) == pytest.approx(wanted, rel=1e-7)
+    assert position_gains(dt=dt, position_weight=position, velocity_weight=velocity) == pytest.approx(wanted, rel=1e-9)
+
+
+@pytest.mark.parametrize("dt", [0.005, 0.02])
+def test_the_position_loop_has_margins(dt):
+    """Broken at the acceleration; an optimal loop has 60 degrees in continuous time, and little less at these steps."""
+    import control as ct
+
+    a, b = double_integrator(dt)
+    gains = position_gains(dt=dt, position_weight=16.0, velocity_weight=4.0)
+    loop = ct.ss(a, b, gains[None], 0.0, dt)
+    response = ct.frequency_response(loop, np.geomspace(0.1, 3.1 / dt, 2000))
+    crossover = int(np.argmin(np.abs(np.log(response.magnitude))))
+    assert np.degrees(response.phase[crossover]) > -180.0 + 55.0
 
 
 def test_a_flight_does_not_wait_for_the_library_that_designs():
     code = "import sys, crazyem.control.lqg; assert 'control' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@given(position=weights, velocity=weights, dt=st.floats(0.001, 0.05))
+def test_the_closed_loop_is_stable_and_optimal(position, velocity, dt):
+    gains = position_gains(dt=dt, position_weight=position, velocity_weight=velocity)
+    a, b = double_integrator(dt)
+    closed = a - b @ gains[None]
+    assert np.abs(np.linalg.eigvals(closed)).max() < 1.0
+
+    def cost(k):
+        """x0' P x0 for two starts, by summing the series by doubling."""
+        m = a - b @ k[None]
+        p, power = np.diag([position, velocity]) + np.outer(k, k), m
+        for _ in range(40):
+            p, power = p + power.T @ p @ power, power @ power
+        return np.trace(p)
+
+    best = cost(gains)
+    for change in np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]) * 0.02 * gains:
+        assert cost(gains + change) >= best * (1 - 1e-12)
 
 
 def test_gains_tend_to_the_continuous_closed_form():

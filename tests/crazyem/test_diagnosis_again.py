@@ -22,7 +22,7 @@ from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.locating.random_torques import AT_RANDOM
 from crazyem.diagnosis.naming import answer, determined
 from crazyem.diagnosis.naming import select as selecting
-from crazyem.diagnosis.naming.named import structure_factor
+from crazyem.diagnosis.naming.named import confidence_factor
 from crazyem.diagnosis.naming.select import select
 from crazyem.diagnosis.naming.trials import Selection
 from crazyem.diagnosis.naming.unexplained import Unexplained, notable
@@ -126,9 +126,9 @@ def test_where_torques_say_nothing_they_say_nothing_against_what_forces_tell():
         return Finding(signal, "x", "always", "", (0.0, 9.0), 1.0, 0.1, "", nats, 1e-9)
 
     remains = Unexplained((left("torque", 300.0), left("body_rate", 90.0)), 900.0)
-    assert structure_factor(remains) == CONFIDENCE.doubtful
-    assert structure_factor(remains.of_forces()) == 1.0
-    assert structure_factor(remains.with_finding(left("force", 100.0)).of_forces()) == CONFIDENCE.doubtful
+    assert confidence_factor(remains) == CONFIDENCE.doubtful
+    assert confidence_factor(remains.of_forces()) == 1.0
+    assert confidence_factor(remains.with_finding(left("force", 100.0)).of_forces()) == CONFIDENCE.doubtful
 
 
 def test_a_rotor_that_pushes_at_random_says_nothing_against_forces_that_last():
@@ -136,12 +136,12 @@ def test_a_rotor_that_pushes_at_random_says_nothing_against_forces_that_last():
     rotor = Finding("torque", "x", "rotor 4 at random", AT_RANDOM, (0.0, 9.0), 1e-4, 1e-5, "N m", 60.0, 1e-9)
     shaken = Finding("torque", "x", "frequency 5.2 Hz", "frequency", (0.0, 9.0), 1e-4, 1e-5, "N m", 60.0, 1e-9)
     remains = Unexplained((rotor,), 900.0)
-    assert structure_factor(remains) == CONFIDENCE.doubtful
-    assert structure_factor(remains.without_random_rotor()) == 1.0
-    assert structure_factor(remains.without_random_rotor(4)) == 1.0  # nor against its being weak
-    assert structure_factor(remains.without_random_rotor(1)) == CONFIDENCE.doubtful
+    assert confidence_factor(remains) == CONFIDENCE.doubtful
+    assert confidence_factor(remains.without_random_rotor()) == 1.0
+    assert confidence_factor(remains.without_random_rotor(4)) == 1.0  # nor against its being weak
+    assert confidence_factor(remains.without_random_rotor(1)) == CONFIDENCE.doubtful
     swinging = remains.with_finding(shaken)  # a loop that swings looks like a drag
-    assert structure_factor(swinging.without_random_rotor()) == CONFIDENCE.doubtful
+    assert confidence_factor(swinging.without_random_rotor()) == CONFIDENCE.doubtful
     data = SimpleNamespace(coarse=False)
     for name, rotor, against in (
         ("linear_drag", 0, False), ("inertia_products", 0, True), ("rotor_fault", 4, False), ("rotor_fault", 1, True),

@@ -24,7 +24,7 @@ from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.naming import answer, determined, trials
 from crazyem.diagnosis.naming.answer import _numbers, _rivals, _uncertainty, strongest_first
 from crazyem.diagnosis.naming.determined import improbable
-from crazyem.diagnosis.naming.named import Named, one_factor, structure_factor
+from crazyem.diagnosis.naming.named import Named, confidence_factor, one_factor
 from crazyem.diagnosis.naming.presence import held_out_evidence, presence
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained
@@ -51,7 +51,7 @@ def test_chance_tells_one_factor_as_several_in_one_of_twenty():
 def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_asked(monkeypatch):
     flown = fly(Hidden(torque=0.7), seconds=12.0, seed=6)
     brought = []
-    monkeypatch.setattr(answer, "structure_factor", lambda remains, nats: brought.append(nats) or 1.0)
+    monkeypatch.setattr(answer, "confidence_factor", lambda remains, nats: brought.append(nats) or 1.0)
     monkeypatch.setattr(trials, "presence", lambda *args, **kwargs: 0.123)
     monkeypatch.setattr(determined, "improbable", lambda chance: "")
     monkeypatch.setattr(answer, "preferred", lambda taken, rivals: 1.0)
@@ -137,13 +137,13 @@ def test_what_is_left_says_less_the_less_of_it_there_is_and_the_more_a_name_brin
     least, most = sorted((held, more))
     few, many = sorted((nats, other))
     assert (
-        structure_factor(left(many), least)
-        <= structure_factor(left(few), least)
-        <= structure_factor(left(few), most)
+        confidence_factor(left(many), least)
+        <= confidence_factor(left(few), least)
+        <= confidence_factor(left(few), most)
         <= 1.0
     )
-    assert structure_factor(left(few, 0.0), most) == 0.0  # but nothing is worth more than its share of the structure
-    assert structure_factor(Unexplained((), 1.0), least) == 1.0
+    assert confidence_factor(left(few, 0.0), most) == 0.0  # but nothing is worth more than its share of the structure
+    assert confidence_factor(Unexplained((), 1.0), least) == 1.0
 
 
 def test_a_name_is_sure_beside_what_it_outweighs() -> None:
@@ -154,7 +154,7 @@ def test_a_name_is_sure_beside_what_it_outweighs() -> None:
         (3.0, 0.5, 0.5),
         (20.0, 0.95, 1.0),
     ):
-        assert least - 1e-3 <= structure_factor(left(26.0), times * 26.0) <= most
+        assert least - 1e-3 <= confidence_factor(left(26.0), times * 26.0) <= most
 
 
 def point_of(**effects: dict[str, Any]) -> Point:

@@ -1,8 +1,10 @@
-"""The table of settings: every number has a comment with its unit or meaning, and stands nowhere else."""
+"""The table of settings: every number has a comment with its unit or meaning; few stand as constants elsewhere."""
 
 import ast
 import dataclasses
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -48,6 +50,21 @@ def test_an_ablation_changes_one_number(monkeypatch):
     finally:
         object.__setattr__(settings.SELECTION, "gain_share", before)
     assert asked == [["diagnose", "a.csv"]]
+
+
+def test_a_default_of_a_function_is_changed_too():
+    """In a process of its own: modules of the diagnosis must not be imported before the change."""
+    code = """
+import inspect
+from benchmarks import ablation
+ablation.change("fitting.rounds=2")
+from crazyem.diagnosis.fitting.fit import refine
+print(inspect.signature(refine).parameters["rounds"].default)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=SOURCE.parents[2], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["2"]
 
 
 @pytest.mark.parametrize("wrong", ["selection.nothing=1", "nowhere.gain_share=1", "selection.max_fitted=many"])

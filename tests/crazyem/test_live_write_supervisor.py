@@ -6,7 +6,7 @@ import fake_drone as fake
 import pytest
 from fake_flight import Estimator, FakeFlight
 
-from crazyem.errors import CrazyemError
+from crazyem.errors import CrazyemError, LinkError
 from crazyem.estimation.steps import LATEST_DECISION
 from crazyem.live.flight import FlightInterruptedError, MotorsCutError
 from crazyem.live.policy import EndRules, HealthLimits, MonitorLimits, Policy
@@ -152,6 +152,22 @@ def test_ctrl_c_keeps_by_default(times, error):
     flown = FakeFlight(fake.FakeLink(), interrupt=times, duration=60.0).fly()
     assert isinstance(flown.error, error)
     assert flown.link.values["ctrlLee.mass"] > 0.03
+
+
+def test_over_a_lost_link_that_refuses_writes_nothing_is_put_back_and_that_is_said():
+    link = fake.FakeLink(lost_at=12000)
+    write = link.write_parameter
+
+    def refusing(name, value, timeout=1.0):
+        if link.fm > 12000:
+            raise LinkError("gone.")
+        return write(name, value, timeout)
+
+    link.write_parameter = refusing
+    flown = FakeFlight(link, duration=60.0).fly()
+    assert isinstance(flown.error, LinkError)
+    assert {p.purpose for p in flown.history.pushes} == {"push"}
+    assert any("were not written back: no telemetry comes" in n for n in flown.history.notices)
 
 
 def test_nothing_is_put_back_that_was_never_pushed():

@@ -16,7 +16,7 @@ from crazyem.diagnosis.fitting.nuisances import error_by_lag, solved, systematic
 from crazyem.diagnosis.naming.balance import Balance, log_odds_by_balance, rotor_loss
 from crazyem.diagnosis.naming.balance import steady as steadily
 from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, load_substitutes
-from crazyem.diagnosis.naming.named import Named, Value, one_factor, structure_factor
+from crazyem.diagnosis.naming.named import Named, Value, confidence_factor, one_factor
 from crazyem.diagnosis.naming.steady_odds import decided_by_balance
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, preferred, wald
 from crazyem.diagnosis.naming.unexplained import Unexplained
@@ -80,7 +80,7 @@ def answer_of(
         rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, selection, corroborated), balance)
         against = _against(remains, candidate, data)
         there = step.taken.presence(order)
-        there *= structure_factor(against, step.taken.held_out) if step.taken.log_odds is None else 1.0
+        there *= confidence_factor(against, step.taken.held_out) if step.taken.log_odds is None else 1.0
         confidence = there * preferred(step.taken, rivals)
         confidence /= 1.0 + sum(float(np.exp(-nats)) for nats in steady.values())
         doubtful = candidate.effect in selection.doubtful

@@ -62,7 +62,7 @@ def interval_95(value: float, sd: float) -> tuple[float, float]:
     return value - 1.96 * sd, value + 1.96 * sd
 
 
-def structure_factor(remains: Unexplained, held_out_nats: float = 0.0) -> float:
+def confidence_factor(remains: Unexplained, held_out_nats: float = 0.0) -> float:
     """Factor on the probability of an effect beside unexplained structure: the right model leaves none.
 
     Physics outside the catalogue imitates effects of about its own size. An effect with a far larger held-out gain is

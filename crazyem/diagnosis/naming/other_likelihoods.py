@@ -12,7 +12,7 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.naming import accelerometer, rotor_response
 from crazyem.diagnosis.naming.detection_limits import usual_gusts
 from crazyem.diagnosis.naming.gusts import find_gusts
-from crazyem.diagnosis.naming.named import Named, Value, interval_95, structure_factor
+from crazyem.diagnosis.naming.named import Named, Value, confidence_factor, interval_95
 from crazyem.diagnosis.naming.presence import presence, presence_by_odds
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.diagnosis.settings import ACCELEROMETER, CONFIDENCE, SELECTION, WIND
@@ -58,7 +58,7 @@ def other_likelihoods(
             if held > 0:
                 # the gain of the regression says nothing of gusts: their own gain counts
                 left = replace(remains.without_force(), gained=gusts.gain)
-                sure = structure_factor(left, held) * presence(gusts.gain, held, gusts.gain)
+                sure = confidence_factor(left, held) * presence(gusts.gain, held, gusts.gain)
                 chance = float(np.exp(-min(held, 700.0)))
                 found.append(Named(GUSTS.name, GUSTS.name, values, {}, held, chance, sure, log_odds=float(logit(sure))))
     if not wanted or accelerometer.EFFECT in wanted:

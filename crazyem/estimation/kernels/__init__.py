@@ -33,7 +33,6 @@ world, body rate (3) rad/s FLU. Noise intensities `q` (6,) are in units of accel
 specific-impulse x y z [(m/s)^2/s] and angular-velocity impulse x y z [(rad/s)^2/s], body frame. `r` (12,) are
 measurement variances."""
 
-# ruff: noqa: F401
 from crazyem.estimation.kernels.filter import forward
 from crazyem.estimation.kernels.layout import (
     AXIS,
@@ -55,3 +54,27 @@ from crazyem.estimation.kernels.layout import (
 from crazyem.estimation.kernels.noise import noise_information
 from crazyem.estimation.kernels.sensitivity import sensitivities, torque_sensitivities
 from crazyem.estimation.kernels.smoother import backward, total
+
+__all__ = [
+    "AXIS",
+    "AXIS_SIZE",
+    "BRIDGE",
+    "COUNT",
+    "DELAY",
+    "IMPULSE",
+    "IMPULSE_SEEN",
+    "LAG",
+    "MASS",
+    "MEASURED",
+    "OFFSET",
+    "PARAMETERS",
+    "RESIDUAL",
+    "RESIDUAL_SEEN",
+    "SIZE",
+    "backward",
+    "forward",
+    "noise_information",
+    "sensitivities",
+    "torque_sensitivities",
+    "total",
+]
