@@ -378,6 +378,8 @@ def _on_recordings(commands: Any) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
+    # before numpy is imported: matrices are small here, and more threads of BLAS only take time from ours
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         arguments = parser().parse_args(argv)
         # In `fly --trajectory hover URI` the option has swallowed the URI.
