@@ -208,11 +208,12 @@ def accelerated(force: NDArray, torque: NDArray, *, body: Body, body_rate: NDArr
 
 def measured(situation: Situation, *, vehicle: Vehicle, effects: Effects) -> Offset:
     """Sum of the measurement errors of all effects: shown less true values."""
-    state, force = np.zeros((situation.size, 12)), np.zeros((situation.size, 3))
+    state, force, tilt = np.zeros((situation.size, 12)), np.zeros((situation.size, 3)), np.zeros((situation.size, 3))
     for effect, values in active(effects, vehicle):
         if effect.measured is not None:
-            turned = state[:, 6:9] if situation.tilt is None else situation.tilt + state[:, 6:9]
+            turned = tilt if situation.tilt is None else situation.tilt + tilt
             added = effect.measured(replace(situation, tilt=turned) if effect.uses_force else situation, **values)
             state += added.state
             force += added.specific_force
-    return Offset(state, force)
+            tilt = tilt + added.filter_tilt
+    return Offset(state, force, tilt)

@@ -132,6 +132,38 @@ def behind(recording: Recording, name: str, lag: float) -> Recording:
     return replace(recording, signals={**recording.signals, name: array_of(name, signal.time, then, place=95)})
 
 
+def test_a_log_that_is_late_does_not_tilt_the_filter_on_board():
+    """The filter believes a tilted frame, and its velocity is off by it. A late log shows the same filter later."""
+    model = Model(replace(flight_of(fly(Hidden(), seconds=6.0, seed=3), DRONE), fused=True))
+    point = Point(DRONE, {}, start_noise())
+    model.settle(point)
+    acceleration = model.accelerations(point)[0]
+
+    def shown(**effects):
+        return model.offsets(replace(point, effects=effects), acceleration)[:, :6]
+
+    filter_on_board = {"lateral_time_constant": 0.2}
+    alone = shown(onboard_filter=filter_on_board)
+    for other, adds_up in (
+        ({"measurement_delay": {"delay": 0.02, "streams": ("state",)}}, True),
+        ({"attitude_misalignment": {"roll": 0.02}}, False),
+    ):
+        together = shown(onboard_filter=filter_on_board, **other)
+        assert np.allclose(together, alone + shown(**other), atol=1e-12) == adds_up
+
+
+def test_a_late_state_of_a_filter_on_board_is_found():
+    """Position, velocity and attitude of a made flight as they were 20 ms ago; the filter may lack the drag."""
+    recording = fly(seconds=12.0, seed=5, rate_noise=2e-3)
+    for name in ("position", "velocity", "attitude"):
+        recording = behind(recording, name, 0.02)
+    data = Data([replace(flight_of(recording, DRONE), fused=True)])
+    late = Candidate("measurement_delay", (("streams", ("state",)),), ("delay",))
+    point = nominal(data, Point(DRONE, {}, start_noise()))
+    fitted = refine_base(data, point.with_effects({"measurement_delay": late.neutral(point)}), [late])
+    assert fitted.point.effects["measurement_delay"]["delay"] == pytest.approx(0.02, abs=1.5e-3)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "parameter", "lags"), [("body_rate", "rate_lag", (0.0, 2e-3)),
                                                          ("velocity", "velocity_lag", (0.0, 1.5e-3))])  # fmt: skip

@@ -24,7 +24,7 @@ from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.settings import NOISE
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
-from crazyem.physics.effects.effect import Effects, Situation
+from crazyem.physics.effects.effect import Effects, Offset, Situation
 from crazyem.physics.motion import measured, motion
 from crazyem.vehicle import Vehicle
 
@@ -136,7 +136,7 @@ class Model:
     _thrusts: dict[str, tuple[NDArray, NDArray]] = field(default_factory=dict)
     _path_situation: Situation | None = None  # along the path
     _row_situation: Situation | None = None  # at the rows
-    _offsets: dict[str, NDArray] = field(default_factory=dict)  # of single effects, at `_row_situation`
+    _offsets: dict[str, Offset] = field(default_factory=dict)  # of single effects, at `_row_situation`
     _diverging: dict[str, bool] = field(default_factory=dict)  # effect -> `diverges`; shared by twins
     _force_needed: bool | None = None
     _vibration: NDArray | None = None
@@ -187,20 +187,20 @@ class Model:
         """
         effects = of_recording(point.effects if effects is None else effects, self.flight.name)
         showing = [name for name in CATALOGUE if name in effects and _changes_measurement(name)]
-        offset = np.zeros((self.flight.time.size, 12))
+        offset, tilt = np.zeros((self.flight.time.size, 12)), np.zeros((self.flight.time.size, 3))
         if not showing:
             return offset
         situation = self._situation_shown(point, accelerations)
         for name in showing:
-            only = {name: effects[name]}
+            key, here = f"{name} {effects[name]!r}", situation
             if CATALOGUE[name].uses_force:  # it depends on the offsets of the effects before it
-                turned = replace(situation, tilt=offset[:, 6:9])
-                offset = offset + measured(turned, vehicle=point.vehicle, effects=only).state
-                continue
-            key = f"{name} {effects[name]!r}"
+                here = replace(situation, tilt=tilt)
+                force = situation.specific_force if situation.model_force is None else situation.model_force
+                key += f" {hash(tilt.tobytes())} {hash(force.tobytes())}"
             if key not in self._offsets or self.observed_acceleration is None:
-                self._offsets[key] = measured(situation, vehicle=point.vehicle, effects=only).state
-            offset += self._offsets[key]
+                self._offsets[key] = measured(here, vehicle=point.vehicle, effects={name: effects[name]})
+            offset += self._offsets[key].state
+            tilt = tilt + self._offsets[key].filter_tilt
         return offset
 
     def _situation_shown(self, point: Point, accelerations: NDArray) -> Situation:

@@ -129,7 +129,7 @@ class Situation:
         fused: whether the measured attitude comes from an onboard filter with the gyro (`onboard_estimate.py`).
         model_force: (n, 3) m/s^2, body: specific force by the model alone; None: as `specific_force`, which may contain
             corrections by measurements.
-        tilt: (n, 3) rad, body: rotation of the measured attitude by other effects; None: no rotation.
+        tilt: (n, 3) rad, body: error of the onboard filter's attitude by other effects; None: no error.
     """
 
     time: NDArray
@@ -189,10 +189,18 @@ class Offset:
     Attributes:
         state: (n, 12) position m and velocity m/s (world), attitude rad (body: shown = true * exp(offset)), rate rad/s.
         specific_force: (n, 3) m/s^2, body.
+        tilt: (n, 3) rad, body: the part of the attitude's error that the onboard filter has itself; None: all of it.
     """
 
     state: NDArray
     specific_force: NDArray
+    tilt: NDArray | None = None
+
+    @property
+    def filter_tilt(self) -> NDArray:
+        """(n, 3) rad, body: error of the attitude in the onboard filter. A log that is late adds to the error shown."""
+        shown: NDArray = self.state[:, 6:9]
+        return shown if self.tilt is None else self.tilt
 
 
 @dataclass(frozen=True)

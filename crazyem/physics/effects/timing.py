@@ -142,7 +142,8 @@ def shown_late(situation: Situation, *, delay: float, streams: str | Sequence[st
     where the drone turns fast (`onboard_estimate.py`). Differences of a filter's rates over some ms are half noise of
     the gyro, and the noise of the same sample that is to be explained; `Situation.integrated` has none.
     """
-    offset = Offset(np.zeros((situation.size, 12)), np.zeros((situation.size, 3)))
+    tilt = np.zeros((situation.size, 3))
+    offset = Offset(np.zeros((situation.size, 12)), np.zeros((situation.size, 3)), tilt)
     if delay == 0.0 or not situation.size:
         return offset
     names = [streams] if isinstance(streams, str) else streams
@@ -159,7 +160,8 @@ def shown_late(situation: Situation, *, delay: float, streams: str | Sequence[st
         offset.state[:, 6:9] -= before * situation.body_rate.take(row, axis=0)
     if "body_rate" in shown:
         offset.state[:, 9:12] = _past(path.body_rate, row, part) - path.body_rate
-        offset.state[:, 6:9] += attitude_error(situation, offset.state[:, 9:12], delay=delay)
+        tilt += attitude_error(situation, offset.state[:, 9:12], delay=delay)
+        offset.state[:, 6:9] += tilt
     if "specific_force" in shown:
         offset.specific_force[:] = _past(situation.specific_force, row, part) - situation.specific_force
     return offset
