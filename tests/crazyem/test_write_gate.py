@@ -319,7 +319,7 @@ def test_a_flight_writes_in_the_air_only_and_restores_on_the_ground(way, outcome
     def write_and_end(name, value, timeout=1.0):
         if name == "ctrlLee.mass":
             flown.interrupts.count = {"first Ctrl-C": 1, "second Ctrl-C": 2}.get(way, 0)
-            flown.estimator.fail_at = 300 if way == "estimator fails" else None
+            flown.estimator.fail_at = 0 if way == "estimator fails" else None  # the next sample
         return write(name, value, timeout)
 
     link.write_parameter, stop, cut = write_and_end, link.stop, []
