@@ -123,7 +123,8 @@ def diagnose(
     remains = unexplained(data, selection, after, apart)
     for finding in (pull, place and place.finding, heading_by_place(data, apart)):
         remains = remains.with_finding(finding) if finding else remains
-    left_out = {**chosen.left_out, **hidden_by_daily_variation(data, selection, chosen.candidates)}
+    left_out = {**chosen.left_out, **selection.left_out}
+    left_out |= hidden_by_daily_variation(data, selection, chosen.candidates)
     pulled = pull is not None or (place is not None and not place.pushed)
     beside = other_likelihoods(data, apart, selection.final, remains, wanted, left_out, pulled, say)
     if any(CATALOGUE[e.name].random for e in beside):

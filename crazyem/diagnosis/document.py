@@ -151,7 +151,7 @@ def _effect(effect: Named) -> dict[str, Any]:
         "parameters": parameters,
         "evidence": {
             "held_out_nats": _number(effect.held_out_nats),
-            "p_value": _number(effect.p_value),
+            "p_value": None,  # not computed; the key goes with the next release
             "log_odds": None if effect.log_odds is None else _number(effect.log_odds),
         },
         "confidence": _number(effect.confidence),
@@ -176,7 +176,7 @@ def _ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         found.append({
             "name": trial.candidate.effect, "label": trial.candidate.label, "words": _words(trial.candidate),
             "gain_nats": _number(trial.gain),
-            "held_out_nats": _number(trial.held_out), "p_value": _number(trial.p_value),
+            "held_out_nats": _number(trial.held_out), "p_value": None,
             "evidence_nats": _number(trial.evidence), "note": "" if trial.fitted else "not fitted: linear estimate",
         })  # fmt: skip
     return found

@@ -128,8 +128,7 @@ class Fitting:
 
     rounds: int = 6  # of Gauss-Newton
     tries: int = 6  # of a step, each a third as long as the last
-    min_round_gain: float = 0.05  # nats; a round that gains less ends the fit
-    min_step_gain: float = 0.005  # nats; a step with a smaller expected gain is not taken: a tenth of an sd
+    min_round_gain: float = 0.05  # nats; a smaller step is the last of a fit, by the linear approximation; assumed
     passes: int = 8  # until the physics is evaluated at the states of the filter
     pass_change: float = 0.2  # nats between two passes, below which they have converged
     max_deviation: float = 2.5  # sd of its prior within which a nuisance stays: 99 % of a normal prior
@@ -192,8 +191,6 @@ class Spectrum:
     surroundings: float = 4.0  # Hz; half width
     hump_width: float = 1.0  # Hz; half width
     min_hump: float = 10.0  # power over that of the surroundings; simulated drones without a missing effect: up to 3.4
-    hump_end: float = 3.0  # the same at the end of a hump
-    max_hump_width: float = 2.0  # Hz
     min_hump_torque: float = 0.15  # over inertia, over the angular acceleration in the band; less may be the loop
     min_line_torque: float = 0.3  # of a line over the swing's change in a step, which an unknown torque leaves whole
     line_surroundings: float = 0.15  # share of the frequency range
@@ -215,19 +212,7 @@ class Selection:
     linear_gain: float = 20.0  # nats; a larger gain of one linear step is checked by the likelihood; assumed
     rival_difference: float = 100.0  # nats; a rival that was worse by less is compared again; assumed
     min_evidence: float = 8.0  # nats of an effect; assumed: odds 50 after 60 candidates
-    look_alike_difference: float = 4.0  # nats; explanations with less are look-alikes; assumed: odds 55
-    separation: float = 1.64  # sd of this difference; with less they are look-alikes, too: 90 %, two-sided
-    p_value: float = 1e-3  # of an effect that is taken, before candidates are counted
-    daily_p_value: float = 1e-4  # for a file with a trim: no test by the scatter of blocks follows there
-    held_out_p_value: float = 5e-2  # below which held-out flights may lower the p-value further
     kept_share: float = 0.5  # of its gain that a second effect keeps beside the first; with less, a look-alike
-    beaten: float = 0.1  # probability of being better, below which a simpler effect does not give the name
-    min_held_out: float = 1.0  # nats on held-out flights that can show the effect
-    informative: float = 6.0  # nats expected, from which held-out flights can show an effect
-    cost_share: float = 0.1  # of its gain that an effect may cost on flights that cannot show it: a hover's own biases
-    hausman_p: float = 0.01  # of the test that an effect has the same size without the peaks of a spectrum (1978)
-    size_difference: float = 1 / 3  # of these sizes: sampled commands alone make some per cent
-    memory_gain: float = 10.0  # nats by disturbances with memory; assumed
     onset_gain: float = 6.0  # nats of an onset; assumed: odds 400
     onset_scans: tuple[tuple[float, float], ...] = ((1.5, 0.1), (0.5, 0.1), (0.1, 0.02))  # s; reach, step of a scan
     separating: float = 3.0  # nats from which another signal separates two effects; assumed: odds 20
@@ -257,14 +242,13 @@ class Confidence:
     other_sd: float = 0.6  # assumed
     freedom: float = 4.0  # of Student's t: flights have unexpected errors of their own; assumed
     file_lacks: float = 0.05  # prior probability that a vehicle file lacks an effect: one drone of 20
-    min_probability: float = 0.5  # of a finding, and of a name beside a rival that is not significant
-    doubtful: float = 0.45  # most beside structure that an effect does not outweigh, or beside a vibration as strong
+    min_probability: float = 0.5  # of a finding
+    doubtful: float = 0.45  # most beside structure that an effect does not outweigh
     outweighs: float = 3.0  # held-out gain of an effect over the structure, at which it is right in one half. Of 88
     # effects in 1268 simulated drones (seeds 2045 to 2048): 18 of 18 at 4 or more, 2 of 8 at 1 to 4, 6 of 62 at less
-    neutral_p: float = 0.05  # p-value above which the size may be neutral: the probability is at most `doubtful`
     improbable: float = 0.1  # below, an effect outside all groups is the nearest explanation: 2 of 18 are right in 1899
     # simulated drones (seeds 2038 to 2043)
-    min_look_alike: float = 0.05  # posterior probability of a reported look-alike
+    min_look_alike: float = 0.05  # probability of being the better explanation, from which one is a look-alike; assumed
     at_bound: float = 1e-9  # of the larger end of a range; a number this close to an end is at the end
 
 
@@ -319,6 +303,7 @@ class RotorResponse:
     max_period: float = 0.025  # s between samples
     min_samples: int = 400  # samples of a recording; assumed
     start_lags: tuple[float, ...] = (0.01, 0.03, 0.08)  # s
+    command_period: float = 2e-3  # s; parts of a sample, in which the command is constant: a loop of 500 Hz
     min_lag: float = 2e-3  # s
     max_lag: float = 0.5  # s
     max_delay: float = 0.1  # s
@@ -327,9 +312,10 @@ class RotorResponse:
     near: tuple[int, int] = (-1, 3)  # samples of the thrust about a command
     min_f: float = 2.0  # first-stage F of the weakest direction (Cragg and Donald 1993): in ten flights of two
     # simulators with known lags the error is at most 5 % from 2.3 on, and up to 34 % below 1.2
-    lag_sd: float = 0.05  # relative; error beyond scatter
-    delay_sd: float = 1.4e-3  # s; the same
-    correlation: float = -0.5  # of these two errors
+    min_voltages: int = 30  # measurements of a voltage that show how the voltage drops under load; assumed
+    lag_sd: float = 0.07  # relative; error beyond scatter: rms of eight flights (seeds 14501, 14602, 14703)
+    delay_sd: float = 2.2e-3  # s; the same
+    correlation: float = -0.6  # of these two errors
     max_residual: float = 3.0  # power of a rotor's residual over the median of the others: up to 1.2 in 13 simulated
     # drones, 5.5 and more in ten flights with a rotor that sticks within 1.4 to 5 % of full command
     independent: float = 10.0  # samples for one independent residual

@@ -40,7 +40,7 @@ def document() -> dict[str, Any]:
             {
                 "name": "thrust_scale",
                 "parameters": {"scale": {"value": 0.6123, "unit": "", "sd": 0.0041, "ci95": [0.604, 0.6205]}},
-                "evidence": {"held_out_nats": 812.4, "p_value": 1e-30},
+                "evidence": {"held_out_nats": 812.4, "p_value": None},
                 "confidence": 0.99,
             },
             {
@@ -50,22 +50,22 @@ def document() -> dict[str, Any]:
                     "y": {"value": 0.0108, "unit": "N s/m", "sd": 0.001, "ci95": [0.0088, 0.0128]},
                     "z": {"value": 0.0021, "unit": "N s/m", "sd": 0.002, "ci95": [-0.0019, 0.0061]},
                 },
-                "evidence": {"held_out_nats": 95.1, "p_value": 3e-9},
+                "evidence": {"held_out_nats": 95.1, "p_value": None},
                 "confidence": 0.93,
             },
         ],
         "ranking": [
-            {"name": "thrust_scale", "held_out_nats": 812.4, "p_value": 1e-30, "note": "claimed"},
+            {"name": "thrust_scale", "held_out_nats": 812.4, "p_value": None, "note": "claimed"},
             {
-                "name": "payload", "gain_nats": 3815.4, "held_out_nats": 811.0, "p_value": 1e-29,
+                "name": "payload", "gain_nats": 3815.4, "held_out_nats": 811.0, "p_value": None,
                 "note": "cannot be told from thrust scale",
             },
-            {"name": "linear_drag", "held_out_nats": 95.1, "p_value": 3e-9, "note": "claimed"},
+            {"name": "linear_drag", "held_out_nats": 95.1, "p_value": None, "note": "claimed"},
             {
                 "name": "battery_sag", "label": "battery_sag[gain_per_second]", "words": "battery sag with time",
-                "held_out_nats": 60.0, "p_value": 1e-4, "note": "",
+                "held_out_nats": 60.0, "p_value": None, "note": "",
             },
-            {"name": "ground_effect", "held_out_nats": -2.5, "p_value": 0.4, "note": "no better on held-out flight"},
+            {"name": "ground_effect", "held_out_nats": -2.5, "p_value": None, "note": "no better on held-out flight"},
         ],
         "indistinguishable": [["thrust_scale", "payload"]],
         "would_separate": ["weigh the drone", "fly straight legs of different speeds in opposite directions"],

@@ -20,7 +20,7 @@ POINT = Point(DRONE, {}, start_noise())
 
 def trial(effect: str, gain: float, *, fitted: bool = True, fixed: tuple[tuple[str, object], ...] = ()) -> Trial:
     there: Any = object() if fitted else None
-    return Trial(Candidate(effect, fixed, ("x",)), gain, 0.0, 1.0, 1e-9, gain - 1, fitted=there)
+    return Trial(Candidate(effect, fixed, ("x",)), gain, 0.0, 1.0, gain - 1, fitted=there, admissible=fitted)
 
 
 def test_what_keeps_its_gain_is_another_thing() -> None:
@@ -45,15 +45,15 @@ def test_what_was_not_asked_again_stays_a_rival() -> None:
     assert additions(Step((trial("inertia", 50.0),), None), []) == frozenset()
 
 
-def test_what_is_not_told_apart_is_a_rival_however_unsure_alone() -> None:
-    taken, sure, unsure = (
+def test_what_is_not_told_apart_is_a_rival_however_small_alone() -> None:
+    taken, large, small = (
         trial("motor_lag", 40.0),
         trial("inertia", 30.0),
-        replace(trial("torque_scale", 33.0), p_value=0.3),
+        replace(trial("torque_scale", 33.0), admissible=False),
     )
-    far = replace(trial("wind", 9.0), p_value=0.3)
-    trials = (taken, unsure, sure, far)
-    assert [t.candidate.effect for t in Step(trials, taken, (unsure,)).explanations()] == [
+    far = replace(trial("wind", 9.0), admissible=False)
+    trials = (taken, small, large, far)
+    assert [t.candidate.effect for t in Step(trials, taken, (small,)).explanations()] == [
         "motor_lag",
         "torque_scale",
         "inertia",

@@ -20,7 +20,7 @@ from crazyem.diagnosis.fitting.nuisances import COARSE_REASON, refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.locating.random_torques import AT_RANDOM
-from crazyem.diagnosis.naming import answer, determined
+from crazyem.diagnosis.naming import answer, trials
 from crazyem.diagnosis.naming import select as selecting
 from crazyem.diagnosis.naming.named import confidence_factor
 from crazyem.diagnosis.naming.select import select
@@ -43,7 +43,7 @@ def slow_to_turn():
 @pytest.mark.slow
 def test_an_inertia_that_no_body_has_leaves_open_what_turns_the_drone(slow_to_turn, monkeypatch):
     wanted = ("inertia", "linear_drag")
-    monkeypatch.setattr(determined, "improbable", lambda chance: "")  # one short flight says little for either
+    monkeypatch.setattr(trials, "presence", lambda *given, **more: 0.9)  # one short flight says little for either
     found = diagnose([slow_to_turn], DRONE, wanted=wanted)
     assert {e.name for e in found.effects} == {"inertia", "linear_drag"}
     assert not found.left_out
@@ -90,7 +90,7 @@ def test_after_an_exchange_the_selection_goes_on(slow_to_turn, monkeypatch):
         return real(*arguments, begun=begun, **more)
 
     def emptied(data, apart, selection, say):
-        return Selection(selection.nominal, selection.nominal, (), (), refine_base(data, selection.nominal, ()), 1)
+        return Selection(selection.nominal, selection.nominal, (), (), refine_base(data, selection.nominal, ()))
 
     monkeypatch.setattr(diagnosing, "select", counted)
     assert [e.name for e in diagnose([slow_to_turn], DRONE, wanted=["linear_drag"]).effects] == ["linear_drag"]

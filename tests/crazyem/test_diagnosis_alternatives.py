@@ -27,7 +27,7 @@ BLOCKS = np.linspace(-1.0, 1.0, 20)
 
 
 def trial(candidate: Candidate, value: float, point: Point) -> Trial:
-    return Trial(candidate, value, 0.0, 1.0, 1e-9, value, SimpleNamespace(point=point), BLOCKS, value)  # type: ignore[arg-type]
+    return Trial(candidate, value, 0.0, 1.0, value, SimpleNamespace(point=point), True, BLOCKS, value)  # type: ignore[arg-type]
 
 
 def asked(monkeypatch: pytest.MonkeyPatch, *, load: float, weaker: float, was: float = 30.0) -> Selection:
@@ -35,7 +35,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, *, load: float, weaker: float, was: f
     were worse by `was` nats when it was taken."""
     taken, other = trial(LOAD, 100.0, POINT), trial(WEAKER, 100.0 - was, THERE)
     steps = (Step((taken, other), taken), Step((), trial(FLAPPING, 20.0, POINT)))
-    selection = Selection(BARE, POINT, steps, (LOAD, FLAPPING), SimpleNamespace(), 34)  # type: ignore[arg-type]
+    selection = Selection(BARE, POINT, steps, (LOAD, FLAPPING), SimpleNamespace())  # type: ignore[arg-type]
 
     def judged(data, held_out, start, candidates):
         assert [c.effect for c in candidates][1] == "velocity_moment"
@@ -71,12 +71,12 @@ def test_of_two_that_are_as_good_the_one_with_fewer_parameters(monkeypatch):
     assert [t.candidate for t in found.steps[0].alike] == [LOAD]  # and it is said
 
 
-def test_what_is_beaten_takes_no_name_however_simple(monkeypatch):
-    """Worse by 3 nats, steadily: not told apart by 4, but not even one in ten believes in it. Three pairs of concealed
-    effects were told as a factor on all torques with 0.00 to 0.10, beside the inertias that were right."""
-    found = asked(monkeypatch, load=106.0, weaker=100.0)
+@pytest.mark.parametrize(("load", "alike"), [(104.0, [WEAKER]), (105.5, [WEAKER]), (106.5, [])])
+def test_what_is_worth_less_takes_no_name_however_simple(monkeypatch, load: float, alike: list[Candidate]) -> None:
+    """Worse by 1, by 2.5 and by 3.5 nats, steadily. Below 2.9, the odds of one in twenty, it is not told apart."""
+    found = asked(monkeypatch, load=load, weaker=100.0)
     assert names(found) == ["payload", "velocity_moment"]
-    assert [t.candidate for t in found.steps[0].alike] == [WEAKER]  # and it is said
+    assert [t.candidate for t in found.steps[0].alike] == alike  # and it is said
 
 
 def test_a_name_that_is_still_the_best_stays(monkeypatch):
@@ -94,7 +94,7 @@ def test_what_was_far_worse_is_not_asked(monkeypatch):
 def test_one_effect_alone_is_not_asked_again(monkeypatch):
     monkeypatch.setattr(alternatives, "refitted", lambda *a: pytest.fail("nothing is new"))
     taken = trial(LOAD, 100.0, POINT)
-    alone = Selection(BARE, POINT, (Step((taken, trial(WEAKER, 99.0, THERE)), taken),), (LOAD,), SimpleNamespace(), 34)  # type: ignore[arg-type]
+    alone = Selection(BARE, POINT, (Step((taken, trial(WEAKER, 99.0, THERE)), taken),), (LOAD,), SimpleNamespace())  # type: ignore[arg-type]
     assert alternatives.with_better_rivals(SimpleNamespace(flights=[], workers=Workers(1)), None, alone) is alone  # type: ignore[arg-type]
     assert replace(alone) == alone
 
@@ -108,7 +108,7 @@ def test_what_ended_where_its_range_ends_gives_way_to_whatever_is_next(monkeypat
                                    "velocity_moment": {"roll_per_vy": 1e-5, "pitch_per_vx": 1e-5}})  # fmt: skip
         taken, other = trial(slope, 1000.0, point), trial(WEAKER, 100.0, THERE)
         steps = (Step((taken, other), taken), Step((), trial(FLAPPING, 20.0, point)))
-        selection = Selection(BARE, point, steps, (slope, FLAPPING), SimpleNamespace(), 34)  # type: ignore[arg-type]
+        selection = Selection(BARE, point, steps, (slope, FLAPPING), SimpleNamespace())  # type: ignore[arg-type]
         monkeypatch.setattr(alternatives, "refitted", lambda data, held_out, start, candidates: (
             (1000.0 if candidates[0] is slope else 100.0), BLOCKS, unknown(candidates)))  # fmt: skip
         monkeypatch.setattr(

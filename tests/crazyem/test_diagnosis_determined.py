@@ -30,7 +30,7 @@ OWN = dict(zip(("xx", "yy", "zz", "time_constant"), (*DRONE.inertia, DRONE.motor
 
 
 def named(effect: str, values: dict[str, Value], **chosen: object) -> Named:
-    return Named(effect, effect, values, dict(chosen), 50.0, 1e-9, 0.95)
+    return Named(effect, effect, values, dict(chosen), 50.0, 0.95)
 
 
 def value(number: float, sd: float, ends: tuple[float, float] | None = None) -> Value:
@@ -144,9 +144,9 @@ def selected(data: Data, *candidates: Candidate, **values: dict[str, float]) -> 
     """A selection of these effects, fitted from these values, the first the weakest."""
     point = nominal(data, POINT)
     fitted = refine_base(data, point.with_effects(values), candidates, rounds=4, noise=False)
-    steps = tuple(Step((), Trial(c, 900.0 + k, 900.0, 1.0, 1e-9, 9.0 + k)) for k, c in enumerate(candidates))
+    steps = tuple(Step((), Trial(c, 900.0 + k, 900.0, 1.0, 9.0 + k)) for k, c in enumerate(candidates))
     steps = tuple(replace(s, taken=s.trials[0]) if s.trials else Step((), s.taken) for s in steps)
-    return Selection(point, fitted.point, steps, candidates, fitted, 2)
+    return Selection(point, fitted.point, steps, candidates, fitted)
 
 
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
@@ -180,6 +180,25 @@ def test_a_number_at_its_end_is_held_at_none_and_the_others_told(monkeypatch: py
     assert [c.free for c in left.accepted] == [("mass", "x", "y")]
     assert left.final.effects["payload"]["z"] == 0.0
     assert left.final.effects["payload"]["mass"] > 0.003
+
+
+def test_an_effect_that_is_found_and_improbable_is_said_with_the_reason() -> None:
+    """A small drag in a short flight: enough for the search, too little for a finding."""
+    flown = fly(Hidden(drag=(0.015, 0.015, 0.0)), seconds=6.0, seed=5)
+    said: list[str] = []
+    found = diagnose([flown], DRONE, wanted=["linear_drag"], say=said.append)
+    assert sum("found linear_drag" in text for text in said) == 1
+    assert sum("left out again" in text for text in said) == 1
+    assert found.effects == ()
+    assert found.fitted_vehicle == DRONE
+    assert not found.mismatch
+    assert found.left_out == found.selection.left_out
+    assert found.left_out.keys() == {"linear_drag"}
+    reason = found.left_out["linear_drag"]
+    assert reason.startswith("not determined: the flights make it probable with 0.")
+    document, _ = document_of(found, [flown])
+    assert {"name": "linear_drag", "reason": reason} in document["not_identifiable"]
+    assert [tried["name"] for tried in document["ranking"]] == ["linear_drag"]  # what was compared stays known
 
 
 # -- what belongs to a recording ------------------------------------------------------------------------------------

@@ -72,7 +72,7 @@ def schema(document: dict[str, Any], *, held_out: bool) -> None:
         assert 0 <= effect["confidence"] <= 1
         assert set(effect["evidence"]) == {"held_out_nats", "p_value", "log_odds"}
         assert isinstance(effect["evidence"]["held_out_nats"], NUMBER)
-        assert isinstance(effect["evidence"]["p_value"], NUMBER)
+        assert effect["evidence"]["p_value"] is None
         assert isinstance(effect["evidence"]["log_odds"], NUMBER)
         known = {p.name: p.unit for p in CATALOGUE[effect["name"]].parameters}
         for name, parameter in effect["parameters"].items():
@@ -82,6 +82,7 @@ def schema(document: dict[str, Any], *, held_out: bool) -> None:
                 assert parameter["unit"] == known[name]
                 assert parameter["ci95"][0] <= parameter["value"] <= parameter["ci95"][1]
         assert possible(effect) == []
+    assert all(tried["p_value"] is None for tried in document["ranking"])
     assert all(isinstance(n, TEXT) for group in document["indistinguishable"] for n in group)
     assert all(isinstance(t, TEXT) for t in document["would_separate"])
     for one in document["unexplained"]["where"]:

@@ -26,8 +26,8 @@ DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
 
 
 def selection_of(point: Point, accepted: tuple[Candidate, ...], fitted: Any = None) -> Selection:
-    steps = tuple(Step((), Trial(c, 50.0, 0.0, 1.0, 1e-9, 46.0)) for c in accepted)
-    return Selection(point, point, steps, accepted, fitted, 34)
+    steps = tuple(Step((), Trial(c, 50.0, 0.0, 1.0, 46.0)) for c in accepted)
+    return Selection(point, point, steps, accepted, fitted)
 
 
 @pytest.mark.parametrize(("trim", "alone"), [(False, 60.0), (True, 104.0), (False, 103.0)])
@@ -78,7 +78,7 @@ def test_a_load_in_the_place_of_weaker_rotors_weighs_what_they_lack(
 
     monkeypatch.setattr(load_or_rotors, "refitted", judged)
     chosen = selection_of(point, (load_or_rotors.WEAKER, DRAG))
-    beside = Trial(LOAD, 1.0, 1.0, 1.0, 0.1, 1.0, fitted=SimpleNamespace() if tried else None)  # type: ignore[arg-type]
+    beside = Trial(LOAD, 1.0, 1.0, 1.0, 1.0, fitted=SimpleNamespace() if tried else None)  # type: ignore[arg-type]
     chosen = replace(chosen, steps=(replace(chosen.steps[0], trials=(beside,)), *chosen.steps[1:]))
     found = load_or_rotors.rotors_against_load(SimpleNamespace(), None, chosen)  # type: ignore[arg-type]
     assert (found is not None) == asked_for == bool(asked)
@@ -94,9 +94,9 @@ def test_weighing_is_asked_for_whether_a_load_is_told_apart_or_not() -> None:
     point = nominal(data, Point(DRONE, {}, start_noise()))
     begun = point.with_effects({"payload": {**LOAD.neutral(point), "mass": 0.0039}})
     fitted = refine_base(data, begun, [LOAD], rounds=1, noise=False)
-    trial = Trial(LOAD, 50.0, 0.0, 1.0, 1e-9, 46.0, fitted, np.zeros(8), 50.0)
+    trial = Trial(LOAD, 50.0, 0.0, 1.0, 46.0, fitted, True, np.zeros(8), 50.0)
     weaker = replace(trial, candidate=load_or_rotors.WEAKER, parameter_cost=4.0)
-    selection = Selection(point, fitted.point, (Step((trial,), trial),), (LOAD,), fitted, 1)
+    selection = Selection(point, fitted.point, (Step((trial,), trial),), (LOAD,), fitted)
     for value, group in ((30.0, ()), (49.0, (("payload", "thrust_scale", "center_of_mass"),))):
         pair = (trial, replace(weaker, value=value))
         told = answer_of(data, selection, Unexplained((), 50.0), corroborated=frozenset(), in_place={"payload": pair})

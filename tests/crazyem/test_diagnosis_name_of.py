@@ -14,93 +14,127 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.naming import select
 from crazyem.diagnosis.naming.evidence import occam_cost, posterior_covariance
-from crazyem.diagnosis.naming.select import compatible, group_of, name_of
-from crazyem.diagnosis.naming.trials import Step, Trial, better, distinguishable, preferred
-from crazyem.diagnosis.settings import SELECTION
+from crazyem.diagnosis.naming.select import alike_with, compatible, step_of
+from crazyem.diagnosis.naming.trials import Step, Trial, better, distinguishable, preferred, scatter
+from crazyem.diagnosis.settings import CONFIDENCE
 from crazyem.diagnosis.workers import Workers
 
 NOISE = np.random.default_rng(0).normal(size=40)
 
 
-def trial(effect: str, free: str, value: float, *, scatter: float = 0.0, p_value: float = 1e-9) -> Trial:
+def trial(effect: str, free: str, value: float, *, scatter: float = 0.0) -> Trial:
     """An explanation by as many numbers as `free` has letters; its likelihood scatters over blocks."""
     there = SimpleNamespace()
     blocks = value / 40 + scatter * NOISE
     return Trial(
-        Candidate(effect, (), tuple(free)), value, 0.0, 1.0, p_value, value - len(free), there, blocks, value,  # type: ignore[arg-type]
+        Candidate(effect, (), tuple(free)), value, 0.0, 1.0, value - len(free), there, True, blocks, value,  # type: ignore[arg-type]
     )  # fmt: skip
 
 
-def test_the_simplest_gives_the_name_where_nothing_beats_it():
-    payload, centre = trial("payload", "mxyz", 101.0), trial("center_of_mass", "xyz", 100.0, scatter=0.3)
-    assert name_of([payload, centre], counted=False) is centre
+@pytest.fixture
+def compared(monkeypatch):
+    """`compared_with_refitted_noise` where no fit changes anything: the name, then its look-alikes."""
+    monkeypatch.setattr(select, "with_noise_refit", lambda basis, trial: trial)
+    basis = SimpleNamespace(held_out=None, data=SimpleNamespace(workers=Workers(1)))
+    return lambda trials: select.compared_with_refitted_noise(basis, trials, say=lambda text: None)[1]
 
 
-def test_what_is_beaten_does_not_however_simple():
-    """Three inertias better by 3.7 nats than a factor on all torques, steadily from block to block: the factor was told
-    first, with a confidence of 0.02."""
+@pytest.mark.parametrize(
+    ("nats", "name", "alike"),
+    [
+        (100.5, "center_of_mass", ["payload"]),  # worth less by half a nat
+        (103.0, "payload", ["center_of_mass"]),  # more by two, whatever the number of parameters
+        (105.0, "payload", []),
+    ],
+)
+@pytest.mark.parametrize("first", [0, 1])
+def test_the_name_goes_to_the_largest_worth(compared, nats: float, name: str, alike: list[str], first: int) -> None:
+    """The nats less the parameters. What is not told apart from it is its look-alike."""
+    payload, centre = trial("payload", "mxyz", nats), trial("center_of_mass", "xyz", 100.0)
+    found = compared([payload, centre] if first == 0 else [centre, payload])
+    assert [t.candidate.effect for t in found] == [name, *alike]
+
+
+def test_what_is_beaten_steadily_is_no_look_alike() -> None:
+    """Three inertias are worth 3.7 nats more than a factor on all torques, steadily from block to block or not."""
     inertia, torque = trial("inertia", "xyz", 105.7), trial("torque_scale", "s", 100.0, scatter=0.25)
-    assert not distinguishable(inertia, torque)  # by less than 4 nats
-    assert better(torque, inertia) < SELECTION.beaten
-    assert name_of([inertia, torque], counted=False) is inertia
+    assert distinguishable(inertia, torque)
     unsteady = trial("torque_scale", "s", 100.0, scatter=1.0)
-    assert better(unsteady, inertia) > SELECTION.beaten
-    assert name_of([inertia, unsteady], counted=False) is unsteady
+    assert not distinguishable(inertia, unsteady)
+    for other in (torque, unsteady):  # neither is the better one
+        assert not distinguishable(other, inertia)
 
 
-def test_recordings_that_differ_widen_the_group_but_do_not_give_the_name():
+@pytest.mark.parametrize(("share", "told"), [(0.99, False), (1.01, True)])
+def test_a_look_alike_is_the_better_explanation_with_one_chance_in_twenty_or_more(share: float, told: bool) -> None:
+    """Log odds of 19 where blocks agree, else 1.645 standard deviations of a normal distribution."""
+    assert CONFIDENCE.min_look_alike == 0.05
+    steady, nats = trial("wind", "x", 100.0), share * np.log(19.0)
+    assert distinguishable(trial("payload", "m", 100.0 + nats), steady) == told
+    unsteady = trial("wind", "x", 100.0, scatter=10.0)
+    sd = scatter(unsteady.blocks)
+    assert sd > 10.0
+    assert distinguishable(trial("payload", "m", 100.0 + share * 1.6449 * sd), unsteady) == told
+
+
+def test_recordings_that_differ_widen_the_group_but_do_not_give_the_name(compared) -> None:
     """Better by 20 nats in most of eight recordings, worse by 13 in three: one group, the better is named."""
     of = np.repeat(np.arange(8), 5)
     apart = np.repeat([20.0, 20.0, 20.0, -13.0, -13.0, -13.0, 20.0, 20.0], 5) / 5
     lags, late = trial("motor_lag", "xyz", 100.0), trial("input_delay", "d", 100.0)
-    best = replace(lags, blocks=lags.blocks + apart, value=100.0 + apart.sum() + 2.0, recording=of)
-    other = replace(late, recording=of)
+    best = replace(lags, blocks=lags.blocks + apart, value=100.0 + apart.sum() + 2.0)
+    assert distinguishable(best, late)
+    best, other = replace(best, recording=of), replace(late, recording=of)
     assert not distinguishable(best, other)
-    assert distinguishable(best, other, recordings=False)
-    assert name_of([best, other], counted=False) is best
+    assert compared([other, best]) == [best, other]
     assert 0.8 < preferred(best, [other]) < 0.95
 
 
-def test_the_group_is_that_of_the_name():
-    """A delay gives the name, though a ground effect is better; a lag loses to that, but not to the delay."""
+def test_the_group_is_that_of_the_name(compared) -> None:
+    """A ground effect is better than a delay, but not surely; a lag loses to the first, though not to the second."""
     ground = trial("ground_effect", "sh", 130.0)
-    late = trial("input_delay", "d", 100.0, scatter=8.0)
-    lag = replace(trial("motor_lag", "t", 90.0), blocks=late.blocks - 0.25 - 2.0 * NOISE)
-    assert not distinguishable(ground, late)
-    assert distinguishable(ground, replace(lag, blocks=ground.blocks - 1.0))
+    late = trial("input_delay", "d", 110.0, scatter=8.0)
+    lag = trial("motor_lag", "t", 109.0)
     assert not distinguishable(late, lag)
-    equals = [ground, late]
-    assert name_of(equals, counted=False) is late
-    assert group_of(late, equals, [*equals, lag], counted=False) == (ground, lag)
-    assert group_of(ground, [ground], [ground, replace(lag, blocks=ground.blocks - 1.0)], counted=False) == ()
+    assert compared([late, ground, lag]) == [ground, late]
 
 
-def test_what_is_not_significant_itself_beats_nothing():
-    centre, payload = trial("center_of_mass", "xyz", 100.0), trial("payload", "mxyz", 130.0, p_value=0.01)
-    assert better(centre, payload) < 1e-3
-    assert name_of([centre, payload], counted=False) is centre
-    assert preferred(centre, [payload]) == 0.5  # was 0.0: a name that nobody believes in, not even who says it
+@pytest.mark.parametrize("same", [True, False])
+def test_an_effect_is_no_look_alike_of_itself(monkeypatch, same: bool) -> None:
+    """Two rotors of which one is weak are one name with two choices."""
+    one = trial("rotor_fault", "s", 100.0)
+    other = replace(one, candidate=Candidate("rotor_fault", (("rotor", 2),), ("s",)))
+    if not same:
+        other = trial("torque_scale", "s", 100.0)
+    monkeypatch.setattr(select, "fitted_trial", lambda basis, trial, solution, *, say: trial)
+    monkeypatch.setattr(select, "compared_with_refitted_noise", lambda basis, trials, *, say: (trials, trials))
+    basis = SimpleNamespace(held_out=None, data=SimpleNamespace(workers=Workers(1)))
+    step = step_of(basis, [(one, None), (other, None)], say=lambda text: None)
+    assert step.taken == one
+    assert step.alike == (() if same else (other,))
 
 
-def test_what_is_better_and_significant_takes_a_name_its_worth():
+def test_what_is_below_its_limit_or_has_little_evidence_is_no_look_alike():
+    centre, payload = trial("center_of_mass", "xyz", 100.0), trial("payload", "mxyz", 101.0)
+    assert alike_with(centre, [payload, centre], counted=False) == [centre, payload]
+    for other in (replace(payload, admissible=False), replace(payload, dispersion=10.0)):  # 101 / 10 - 4 nats
+        assert alike_with(centre, [other, centre], counted=False) == [centre]
+
+
+def test_what_is_better_takes_a_name_its_worth():
     centre, payload = trial("center_of_mass", "xyz", 100.0), trial("payload", "mxyz", 130.0)
     assert preferred(centre, [payload]) < 1e-3
     assert preferred(payload, [centre]) > 0.999
     assert preferred(payload, []) == 1.0
 
 
-def test_what_ruins_the_flights_held_out_explains_nothing_however_significant():
+def test_what_ruins_the_flights_held_out_explains_nothing_however_large():
     """A damping fitted in a hover, which took 22000 nats from a quick flight and half the trust in a rotor inertia."""
     taken, ruin = trial("rotor_inertia", "i", 219.0), replace(trial("rate_damping", "xyz", 25.0), evidence=-21964.0)
     assert Step((taken, ruin), taken).explanations() == [taken]
     assert Step((taken, ruin), taken, alike=(ruin,)).explanations() == [taken, ruin]
     both = replace(ruin, value=taken.value + 1.0)  # as fitted to all flights it explains more than the one taken
     assert Step((taken, both), taken).explanations() == [taken, both]
-
-
-def test_without_evidence_enough_the_first_gives_the_name():
-    first, simple = trial("inertia", "xyz", 20.0), trial("torque_scale", "s", 6.0, scatter=3.0)
-    assert name_of([first, simple], counted=False) is first
 
 
 def test_what_is_already_there_in_another_form_is_not_asked():
@@ -128,8 +162,9 @@ def test_the_better_explanation_of_all_flights_leads_whichever_ruins_those_held_
     assert trials[0] is linear
     assert equals == [quadratic]
     assert given == [own, own]  # all that are compared begin with the same noise of the flights held out
-    unsure = replace(quadratic, p_value=0.5)  # what may not be taken does not lead, however well it would fit
-    assert select.compared_with_refitted_noise(basis, [linear, unsure], say=lambda text: None)[1][0] is linear
+    # what may not be taken does not lead, however well it would fit: a small effect, and one of little evidence
+    for small in (replace(quadratic, admissible=False), replace(quadratic, dispersion=1000.0)):
+        assert select.compared_with_refitted_noise(basis, [linear, small], say=lambda text: None)[1][0] is linear
 
 
 @given(st.lists(st.floats(1e-3, 1.0), min_size=4, max_size=4), st.integers(0, 1000))

@@ -21,11 +21,10 @@ from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import error_by_lag, nuisances, refine_base, systematic_sd
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.locate import Finding
-from crazyem.diagnosis.naming import answer, determined, trials
+from crazyem.diagnosis.naming import answer, trials
 from crazyem.diagnosis.naming.answer import _numbers, _rivals, _uncertainty, strongest_first
-from crazyem.diagnosis.naming.determined import improbable
 from crazyem.diagnosis.naming.named import Named, confidence_factor, one_factor
-from crazyem.diagnosis.naming.presence import held_out_evidence, presence
+from crazyem.diagnosis.naming.presence import held_out_evidence, improbable, presence
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.diagnosis.settings import CONFIDENCE, FITTING
@@ -52,11 +51,10 @@ def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_as
     flown = fly(Hidden(torque=0.7), seconds=12.0, seed=6)
     brought = []
     monkeypatch.setattr(answer, "confidence_factor", lambda remains, nats: brought.append(nats) or 1.0)
-    monkeypatch.setattr(trials, "presence", lambda *args, **kwargs: 0.123)
-    monkeypatch.setattr(determined, "improbable", lambda chance: "")
+    monkeypatch.setattr(trials, "presence", lambda *args, **kwargs: 0.623)
     monkeypatch.setattr(answer, "preferred", lambda taken, rivals: 1.0)
     found = diagnose([flown], DRONE, wanted=["inertia"])
-    assert [(e.name, e.confidence) for e in found.effects] == [("inertia", pytest.approx(0.123))]
+    assert [(e.name, e.confidence) for e in found.effects] == [("inertia", pytest.approx(0.623))]
     assert brought == [found.effects[0].held_out_nats] != [0.0]  # what is weighed against what is left
     assert found.indistinguishable == (("inertia", "torque_scale"),)
 
@@ -65,7 +63,7 @@ def test_what_is_found_beside_the_selection_stands_where_its_evidence_puts_it():
     """A late input of 72 nats was told after a doubtful drag of 9."""
 
     def named(name: str, held_out: float) -> Named:
-        return Named(name, name, {}, {}, held_out, 0.0, 0.95)
+        return Named(name, name, {}, {}, held_out, 0.95)
 
     told = [named("thrust_scale", 500.0), named("linear_drag", 9.0), named("wind", 20.0)]  # by evidence on all flights
     found = strongest_first(told, [named("input_delay", 72.0), named("gusts", 3.0)])
@@ -94,13 +92,23 @@ def test_flight_that_can_tell_nothing_of_an_effect_says_nothing_of_it(held: floa
 
 
 def test_a_trial_is_judged_by_what_is_expected_of_it_on_held_out_flights() -> None:
-    """30 nats over a dispersion of 3; without held-out flights, as many are expected of blocks as of the whole."""
-    trial = Trial(Candidate("linear_drag", (), ("x",)), 90.0, -4.0, 3.0, 1e-9, 26.0)
-    for expected, of_trial in ((0.0, 0.0), (27.0, 27.0), (90.0, None)):
-        found = replace(trial, expected=of_trial).presence(2)
+    """90 nats over a dispersion of 3; without held-out flights, nothing is expected and nothing is said."""
+    trial = Trial(Candidate("linear_drag", (), ("x",)), 90.0, -4.0, 3.0, 26.0)
+    for expected in (0.0, 27.0):
+        found = replace(trial, expected=expected).presence(2)
         assert found == pytest.approx(presence(30.0, -4.0, expected, 2, dispersion=3.0))
+    for held in (-4.0, 500.0):  # of blocks of the fitted flights
+        assert replace(trial, held_out=held).presence(1) == pytest.approx(presence(30.0, 0.0, 0.0))
     hover, quick = (replace(trial, expected=e).presence(1) for e in (0.0, 90.0))
     assert hover > 1.3 * quick
+
+
+def test_an_effect_is_judged_by_the_flights_that_show_it_best() -> None:
+    """Whichever of them are called held out, if those can show it at all."""
+    trial = Trial(Candidate("linear_drag", (), ("x",)), 30.0, 90.0, 3.0, 26.0, expected=60.0)
+    assert trial.presence(2) == pytest.approx(presence(30.0, 90.0, 60.0, 2, dispersion=3.0))
+    assert replace(trial, gain=120.0).presence(2) == pytest.approx(presence(40.0, 90.0, 60.0, 2, dispersion=3.0))
+    assert replace(trial, expected=0.0).presence(2) == pytest.approx(presence(10.0, 0.0, 0.0, 2))
 
 
 def test_a_name_is_as_sure_as_what_it_brings_on_flight_held_out_and_fitted() -> None:
@@ -181,7 +189,7 @@ def test_intervals_count_by_how_much_flights_differ_where_there_are_many() -> No
     information = np.tile(np.diag([100.0, 100.0]), (90, 1, 1))
     for flights, freedom in ((np.repeat(np.arange(9), 10), 8), (np.zeros(90, int), 0)):
         fitted = Fitted(point_of(), (), 0.0, Gram(score, information, flights), np.zeros(2))
-        sd, width, covariance, _ = _uncertainty(fitted)
+        sd, width, covariance = _uncertainty(fitted)
         assert np.sqrt(np.diag(covariance)) == pytest.approx(sd)
         if freedom:
             assert sd[0] == pytest.approx(np.std(np.append([1.0, -1.0] * 4, 0.0), ddof=1) / 3.0, rel=0.1)
@@ -242,7 +250,7 @@ def test_inertias_are_as_unsure_as_a_lag_that_is_a_little_wrong_makes_them() -> 
 def test_what_is_needed_beside_a_name_is_no_other_name_for_it(accepted: list[str], rivals: set[str]) -> None:
     """Of drag and gyro bias, both hidden and both found, each was told as perhaps the other (2045/0179)."""
     one, *others = (
-        Trial(Candidate(n, (), ("x",)), 50.0, 20.0, 1.0, 1e-9, 60.0)
+        Trial(Candidate(n, (), ("x",)), 50.0, 20.0, 1.0, 60.0)
         for n in ("velocity_moment", "inertia", "torque_scale", "rate_damping")
     )
     step = Step((one, *others), one, alike=tuple(others))
@@ -256,6 +264,6 @@ def test_what_is_needed_beside_a_name_is_no_other_name_for_it(accepted: list[str
 
 def test_later_effects_are_told_by_how_many_were_found_before_them_but_a_trim() -> None:
     names, point = ("wind", "trim", "payload", "motor_lag"), Point(DRONE, {}, start_noise())
-    steps = tuple(Step((), Trial(Candidate(n, (), ()), 1.0, 1.0, 1.0, 0.0, 1.0)) for n in names)
-    selection = Selection(point, point, (*steps, Step((), None)), (), SimpleNamespace(), 4)  # type: ignore[arg-type]
+    steps = tuple(Step((), Trial(Candidate(n, (), ()), 1.0, 1.0, 1.0, 1.0)) for n in names)
+    selection = Selection(point, point, (*steps, Step((), None)), (), SimpleNamespace())  # type: ignore[arg-type]
     assert selection.orders() == [1, 2, 2, 3]

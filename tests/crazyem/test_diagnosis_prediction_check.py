@@ -28,8 +28,8 @@ def selected(data: Data, found: dict[str, tuple[Candidate, dict[str, float]]]) -
     candidates = [c for c, _ in found.values()]
     fitted = refine_base(data, begun, candidates, rounds=1, noise=False)
     final = fitted.point.with_effects({name: values for name, (_, values) in found.items()})
-    steps = tuple(Step((), Trial(c, 100.0, 100.0, 1.0, 1e-9, 100.0)) for c in candidates)
-    return Selection(point, final, steps, tuple(candidates), replace(fitted, point=final), 2)
+    steps = tuple(Step((), Trial(c, 100.0, 100.0, 1.0, 100.0)) for c in candidates)
+    return Selection(point, final, steps, tuple(candidates), replace(fitted, point=final))
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""What is left out again: an effect that noise explains as well must speak on flights held out, or go."""
+"""What is left out again because it is improbable beside the others, and what is too small for a finding."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -8,165 +8,247 @@ import pytest
 from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal
-from crazyem.diagnosis.fitting.gram import Gram
+from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import held_out_fit, refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import prune
 from crazyem.diagnosis.naming.detection_limits import exceeds_limit, is_implausible
+from crazyem.diagnosis.naming.evidence import joint_gain
 from crazyem.diagnosis.naming.select import at_linear_size, shortlist
-from crazyem.diagnosis.naming.trials import Step, Trial, significance
-from crazyem.diagnosis.settings import SELECTION
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial
+from crazyem.diagnosis.settings import CONFIDENCE
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.prior import Conditions
 
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
-TAKEN = Step((), Trial(DRAG, gain=30.0, held_out=20.0, dispersion=2.0, p_value=1e-6, evidence=12.0))
 POINT = Point(DRONE, {}, start_noise())
-
-
-@pytest.fixture
-def no_scatter(monkeypatch):
-    """Fits that are no more than log-likelihoods scatter as their model says."""
-    monkeypatch.setattr(prune, "dispersion_of", lambda *a, **k: 1.0)
-
-
-def survivors(monkeypatch, *, p_value, held, gained=50.0, held_out=True):
-    """What `without_noise_look_alikes` keeps where torques that wander gain `gained` nats; p-values it asked for."""
-    asked = []
-
-    def significance(fitted, count, *, offset):
-        asked.append((count, offset))
-        return p_value
-
-    fitted = SimpleNamespace(point=POINT)
-    monkeypatch.setattr(prune, "refine_base", lambda *a, **k: fitted)
-    monkeypatch.setattr(prune, "significance", significance)
-    monkeypatch.setattr(prune, "held_gain", lambda *a: held)
-    apart = SimpleNamespace(fit_noise=lambda point: point, loglik=lambda point, passes: gained)
-    data = SimpleNamespace(twin=lambda: apart, loglik=lambda point, passes: 0.0)  # what wanders is fitted on a twin
-    _, accepted, steps = prune.without_noise_look_alikes(
-        data, fitted, [DRAG], [TAKEN], SimpleNamespace() if held_out else None, lambda text: None
-    )
-    assert bool(accepted) == bool(steps)
-    return accepted, asked
-
-
-@pytest.mark.parametrize(
-    ("p_value", "held", "held_out", "kept"),
-    [
-        (SELECTION.p_value / 2, 0.0, False, True),
-        (SELECTION.p_value / 2, 0.0, True, True),
-        (SELECTION.p_value * 2, 0.0, False, False),
-        (SELECTION.p_value * 2, 0.0, True, False),
-        (SELECTION.p_value * 2, 20.0, False, False),  # there is nothing held out to gain on
-        (SELECTION.p_value * 2, 20.0, True, True),  # by chance with exp(-20 / dispersion)
-        (SELECTION.p_value * 2, 1.0, True, False),
-        (SELECTION.held_out_p_value * 2, 100.0, True, False),  # too doubtful where it was fitted
-    ],
-)
-def test_an_effect_that_wandering_torques_explain(monkeypatch, p_value, held, held_out, kept):
-    accepted, asked = survivors(monkeypatch, p_value=p_value, held=held, held_out=held_out)
-    assert accepted == ([DRAG] if kept else [])
-    assert asked == [(3, 0)]
-
-
-def test_where_torques_do_not_wander_nothing_is_asked(monkeypatch):
-    accepted, asked = survivors(monkeypatch, p_value=1.0, held=0.0, gained=SELECTION.memory_gain / 2)
-    assert accepted == [DRAG]
-    assert asked == []
+TRIMMED = replace(DRONE, effects={"trim": dict.fromkeys("xyz", 0.0)})  # a drag is free in every fit with such a file
 
 
 @pytest.mark.slow
-def test_what_is_expected_on_flights_held_out_is_what_their_likelihood_would_lose():
+@pytest.mark.parametrize(
+    ("candidate", "hidden", "vehicle", "begin", "reach"),
+    [
+        # what is always free stays within its bounds
+        (Candidate("torque_scale", (), ("scale",)), Hidden(torque=0.85), DRONE, {"scale": 0.95}, 0.2),
+        (DRAG, Hidden(drag=(0.05, 0.05, 0.05)), TRIMMED, dict.fromkeys("xyz", 0.02), 0.5),
+    ],
+)
+def test_what_is_expected_on_flights_held_out_is_what_their_likelihood_would_lose(
+    candidate, hidden, vehicle, begin, reach
+):
     """Against the curve of the likelihood held out over the size of the effect, what is always free fitted to each."""
-    candidate = Candidate("torque_scale", (), ("scale",))
-    data, apart = (Data([flight_of(fly(Hidden(torque=0.85), seconds=s, seed=s), DRONE)]) for s in (6, 14))
-    point = nominal(data, POINT)
-    begun = point.with_effects({"torque_scale": {"scale": 0.95}})
-    fitted = refine_base(data, begun, [candidate], noise=False)
-    here = fitted.point.effects["torque_scale"]["scale"]
-    scales = here + np.linspace(-0.03, 0.03, 7)  # what is always free stays within its bounds
-    points = [fitted.point.with_effects({"torque_scale": {"scale": s}}) for s in scales]
-    values = [held_out_fit(apart, p, [candidate]).loglik for p in points]
-    bend = np.polynomial.Polynomial.fit(scales, values, 2).deriv(2)(here)
-    found = prune.expected(apart, fitted, [candidate], candidate)
-    wanted = -0.5 * bend * (here - 1.0) ** 2
-    # 34 against 52 nats when written: bounds of what is always free and terms of second order are left out. It decides
-    # between a flight that can answer and one that cannot, for which a factor of two does.
-    assert wanted / 2 < found < wanted * 2
-    assert found > SELECTION.informative
+    data, apart = (Data([flight_of(fly(hidden, seconds=s, seed=s), vehicle)]) for s in (6, 14))
+    point = nominal(data, Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, start_noise()))
+    fitted = refine_base(data, point.with_effects({candidate.effect: begin}), [candidate], noise=False)
+    here, neutral = (f(fitted.point) for f in (candidate.values, candidate.neutral))
+    sizes = 1.0 + np.linspace(-reach, reach, 7)  # over that of the fit
+    points = [
+        fitted.point.with_effects({candidate.effect: {n: neutral[n] + s * (here[n] - neutral[n]) for n in begin}})
+        for s in sizes
+    ]
+    fixed = apart.constraining(candidate.effect) if candidate is DRAG else apart  # as in the fit without it
+    values = [held_out_fit(fixed, p, [candidate]).loglik for p in points]
+    wanted = -0.5 * np.polynomial.Polynomial.fit(sizes, values, 2).deriv(2)(1.0)
+    there = held_out_fit(fixed, fitted.point, [candidate])
+    for found in (
+        prune._expected(apart, fitted, [candidate], candidate),
+        joint_gain(fitted, fixed, there, [candidate]).expected,
+    ):
+        # 34 against 52 nats of the torque when written: bounds of what is always free and terms of second order are
+        # left out. It tells a flight that can answer from one that cannot, for which a factor of two does.
+        assert wanted / 2 < found < wanted * 2
 
 
-@pytest.mark.usefixtures("no_scatter")
-@pytest.mark.parametrize(("slope", "kept"), [(-0.9, True), (-0.5, False)])
-def test_what_holds_another_within_its_range_stays(monkeypatch, slope, kept):
-    """A thrust scale brings too little, but without it a thrust curve goes on to where commands are not heeded."""
-    scale, curve = (Candidate(n, (), (p,)) for n, p in (("thrust_scale", "scale"), ("thrust_curve", "slope_error")))
-    with_both = POINT.with_effects({"thrust_scale": {"scale": 0.8}, "thrust_curve": {"slope_error": -0.4}})
-    alone = POINT.with_effects({"thrust_curve": {"slope_error": slope}})
-    fitted, bare = SimpleNamespace(point=with_both), SimpleNamespace(point=alone)
-    steps = [replace(TAKEN, taken=replace(TAKEN.taken, candidate=c)) for c in (scale, curve)]
-    lost = {scale: 5.0, curve: 300.0}
-    fits = {c: SimpleNamespace(point=alone, loglik=-nats) for c, nats in lost.items()}
-    monkeypatch.setattr(prune, "fit_without", lambda data, held_out, fitted, accepted, c: (fits[c], 0.0))
-    monkeypatch.setattr(prune, "refine_base", lambda *a, **k: bare)
-    data = SimpleNamespace(loglik=lambda point, passes: 0.0, settle=lambda point: None, workers=Workers(1))
-    found, accepted, left = prune.backward_elimination(data, fitted, [scale, curve], steps, None, lambda text: None)
-    assert accepted == ([scale, curve] if kept else [curve])
-    assert [s.taken.candidate for s in left] == accepted
-    assert found is (fitted if kept else bare)
+def test_a_drag_is_expected_to_gain_against_none_of_it_not_against_a_usual_one(monkeypatch):
+    """Free in every fit, it is held at none where it is the question; other nuisances are free without the effect."""
+    apart = Data([flight_of(fly(seconds=6.0), TRIMMED)])
+    drag = {"linear_drag": dict.fromkeys("xyz", 0.05)}
+    fitted = SimpleNamespace(point=Point(TRIMMED, {**TRIMMED.effects, **drag}, start_noise()))
+    found = prune._expected(apart, fitted, [DRAG], DRAG)
+    assert found == pytest.approx(prune._expected(apart.constraining("linear_drag"), fitted, [DRAG], DRAG))
+    assert not apart.constrained
+    monkeypatch.setattr(prune, "can_be_finding", lambda candidate: False)
+    assert prune._expected(apart, fitted, [DRAG], DRAG) < 0.9 * found
 
 
-@pytest.mark.usefixtures("no_scatter")
-@pytest.mark.parametrize(("expected", "held", "kept"), [(1.0, -25.0, True), (1.0, -31.0, False), (20.0, -25.0, True),
-                                                        (50.0, -5.0, False), (50.0, 5.0, True)])  # fmt: skip
-def test_flights_held_out_are_asked_where_they_can_answer(monkeypatch, expected, held, kept):
-    """An effect that brings 300 nats where it was fitted, and `held` where `expected` nats would be the effect's.
+def selection_of(*trials, point=POINT):
+    steps = (*(Step((t,), t, (trial("wind"),)) for t in trials), Step((), None))
+    return Selection(POINT, point, steps, tuple(t.candidate for t in trials), SimpleNamespace(point=point))
 
-    A flight that cannot show it, or less than a tenth of that, may speak against it with a tenth of that: hovers have
-    biases of their own.
+
+def trial(effect, free=("mass",), **more):
+    """An effect of which flights said nothing when it was taken."""
+    return Trial(Candidate(effect, (), free), 0.0, 0.0, 1.0, 0.0, **more)
+
+
+@pytest.fixture
+def pruned(monkeypatch):
+    """`prune.pruned` with fits that are no more than log-likelihoods, and what it said.
+
+    `lost(accepted, candidate)`: nats on fitted and on held-out flights that go with an effect. `expected`: of held-out
+    flights. `without`: effect -> the model where it is left out.
     """
-    fitted = SimpleNamespace(point=POINT, loglik=0.0)
-    bare = SimpleNamespace(point=POINT, loglik=-300.0)
-    monkeypatch.setattr(prune, "expected", lambda *a: expected)
-    monkeypatch.setattr(prune, "fit_without", lambda *a: (bare, -held))
-    monkeypatch.setattr(prune, "held_out_fit", lambda *a: SimpleNamespace(loglik=0.0))
-    monkeypatch.setattr(prune, "refine_base", lambda *a, **k: bare)
-    data = SimpleNamespace(loglik=lambda point, passes: 0.0, workers=Workers(1))
-    monkeypatch.setattr(prune, "nuisances", lambda *a: [])
-    _, accepted, left = prune.backward_elimination(data, fitted, [DRAG], [TAKEN], SimpleNamespace(), lambda text: None)
-    assert accepted == ([DRAG] if kept else [])
-    for step in left:  # the probability of an effect is that in the final model
-        taken = step.taken
-        assert (taken.gain, taken.held_out, taken.expected, taken.dispersion) == (300.0, held, expected, 1.0)
+
+    def of(selection, lost, *, expected=0.0, held_out=True, without=None):
+        def fit_without(data, held_out, fitted, accepted, candidate):
+            nats, held = lost(accepted, candidate)
+            return SimpleNamespace(point=(without or {}).get(candidate.effect, POINT), loglik=-nats), -held
+
+        said, settled = [], [selection.final]
+        monkeypatch.setattr(prune, "_fit_without", fit_without)
+        monkeypatch.setattr(prune, "_expected", lambda *a: expected)
+        monkeypatch.setattr(prune, "dispersion_of", lambda *a, **k: 1.0)
+        monkeypatch.setattr(prune, "held_out_twin", lambda held_out, point, accepted: held_out)
+        monkeypatch.setattr(prune, "held_out_fit", lambda *a: SimpleNamespace(loglik=0.0))
+        monkeypatch.setattr(
+            prune, "refine_base", lambda data, point, accepted: settled.append(point) or SimpleNamespace(point=point)
+        )
+        data = SimpleNamespace(loglik=lambda point, passes: 0.0, settle=settled.append, workers=Workers(1))
+        found = prune.pruned(data, selection, SimpleNamespace() if held_out else None, said.append)
+        assert [s.taken.candidate for s in found.steps if s.taken] == list(found.accepted)
+        assert found.fitted.point is found.final is settled[-1]
+        gone = [c.effect for c in selection.accepted if c not in found.accepted]
+        assert sorted(found.left_out) == sorted([*selection.left_out, *gone])
+        assert all(text.startswith("not determined: the flights make it") for text in found.left_out.values())
+        assert sorted(text.rpartition(": ")[2] for text in said) == sorted(gone)
+        for before, after in zip(selection.steps, found.steps, strict=True):  # what a turn compared stays known
+            assert after.trials is before.trials
+            assert after.alike == (before.alike if after.taken else ())
+        return found, [text.rpartition(": ")[2] for text in said]
+
+    return of
 
 
-@pytest.mark.usefixtures("no_scatter")
-def test_what_no_flight_needs_goes_before_what_one_speaks_against(monkeypatch):
+@pytest.mark.parametrize(
+    ("slope", "said", "left"),
+    [
+        (-0.9, ["linear_drag"], ["thrust_scale", "thrust_curve"]),
+        (-0.5, ["thrust_scale", "linear_drag"], ["thrust_curve"]),
+    ],
+)
+def test_what_holds_another_within_its_range_stays_and_the_next_is_asked(pruned, slope, said, left):
+    """A thrust scale brings too little, but without it a thrust curve goes on to where commands are not heeded."""
+    scale, curve = trial("thrust_scale", ("scale",)), trial("thrust_curve", ("slope_error",))
+    drag = trial("linear_drag", ("x",))
+    both = POINT.with_effects({"thrust_scale": {"scale": 0.8}, "thrust_curve": {"slope_error": -0.4}})
+    alone = POINT.with_effects({"thrust_curve": {"slope_error": slope}})
+    lost = {scale.candidate: 5.0, drag.candidate: 10.0, curve.candidate: 300.0}
+    found, gone = pruned(
+        selection_of(scale, drag, curve, point=both),
+        lambda accepted, c: (lost[c], 0.0),
+        held_out=False,
+        without={"thrust_scale": alone, "linear_drag": both if slope == -0.9 else alone},
+    )
+    assert gone == said
+    assert [c.effect for c in found.accepted] == left
+    assert found.final is (both if slope == -0.9 else alone)
+
+
+ALONE, SECOND = (  # nats from which an effect is more likely than not, as the first and as the second that was found
+    np.exp((np.log(order) * CONFIDENCE.order_power - CONFIDENCE.intercept) / CONFIDENCE.gain_power) - 1.0
+    for order in (1, 2)
+)
+BETWEEN = np.sqrt(ALONE * SECOND)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "said"),
+    [
+        (1.1 * ALONE, 1.1 * SECOND, []),
+        (0.5 * ALONE, BETWEEN, ["payload"]),  # the second is the only one then
+        (1.1 * BETWEEN, BETWEEN, ["linear_drag"]),
+        (BETWEEN, 1.1 * BETWEEN, ["linear_drag"]),  # the first is likely enough for a first
+        (0.5 * ALONE, 0.4 * ALONE, ["linear_drag", "payload"]),
+        (0.4 * ALONE, 0.5 * ALONE, ["payload", "linear_drag"]),  # whatever was found first
+    ],
+)
+def test_the_least_probable_goes_first_and_the_others_are_judged_again(pruned, first, second, said):
+    load, drag = trial("payload"), trial("linear_drag", ("x",))
+    lost = {load.candidate: first, drag.candidate: second}
+    _, gone = pruned(selection_of(load, drag), lambda accepted, c: (lost[c], 0.0), held_out=False)
+    assert gone == said
+
+
+@pytest.mark.parametrize(
+    ("expected", "held", "kept"),
+    [(0.0, -25.0, True), (1.0, -25.0, True), (50.0, 50.0, True), (50.0, 0.0, False), (50.0, -50.0, False)],
+)
+def test_flights_held_out_are_asked_where_they_can_answer(pruned, expected, held, kept):
+    """An effect that brings 100 nats where it was fitted, and `held` where a real one brings `expected`.
+
+    A flight that cannot show it does not speak against it: hovers have biases of their own.
+    """
+    drag = trial("linear_drag", ("x", "y", "z"))
+    found, _ = pruned(selection_of(drag), lambda accepted, c: (100.0, held), expected=expected)
+    assert found.accepted == ((drag.candidate,) if kept else ())
+    taken = found.steps[0].taken
+    if kept:  # the probability of an effect is that in the final model
+        assert (taken.gain, taken.held_out, taken.expected, taken.dispersion) == (100.0, held, expected, 1.0)
+
+
+@pytest.mark.parametrize(("nats", "kept"), [(1.1 * ALONE, True), (0.9 * ALONE, False)])
+@pytest.mark.parametrize("held", [-60.0, 60.0])
+def test_without_flights_held_out_blocks_of_the_fitted_ones_say_nothing(pruned, nats, kept, held):
+    drag = replace(trial("linear_drag", ("x",)), held_out=held)
+    found, _ = pruned(selection_of(drag), lambda accepted, c: (nats, 7.0), held_out=False)
+    assert found.steps[0].taken == (replace(drag, gain=nats) if kept else None)
+
+
+def test_what_no_flight_needs_goes_before_what_one_speaks_against(pruned):
     """A payload of no mass beside a load on a string, which a hover does not confirm while the payload is there."""
-    payload, load = (Candidate(n, (), ("mass",)) for n in ("payload", "suspended_load"))
-    steps = [replace(TAKEN, taken=replace(TAKEN.taken, candidate=c)) for c in (payload, load)]
-    fitted = SimpleNamespace(point=POINT, loglik=0.0)
+    payload, load = trial("payload"), trial("suspended_load")
 
-    def bare_fit(data, held_out, fitted, accepted, candidate):
-        nats, held = {payload: (2.0, 0.0), load: (200.0, -14.0 if payload in accepted else 300.0)}[candidate]
-        return SimpleNamespace(point=POINT, loglik=-nats), -held
+    def lost(accepted, candidate):
+        return (2.0, 0.0) if candidate is payload.candidate else (200.0, 300.0 if len(accepted) == 1 else -280.0)
 
-    monkeypatch.setattr(prune, "expected", lambda *a: 280.0)
-    monkeypatch.setattr(prune, "fit_without", bare_fit)
-    monkeypatch.setattr(prune, "held_out_fit", lambda *a: SimpleNamespace(loglik=0.0))
-    monkeypatch.setattr(prune, "refine_base", lambda *a, **k: fitted)
-    monkeypatch.setattr(prune, "nuisances", lambda *a: [])
-    data = SimpleNamespace(loglik=lambda point, passes: 0.0, settle=lambda point: None, workers=Workers(1))
-    said = []
-    _, accepted, left = prune.backward_elimination(data, fitted, [payload, load], steps, SimpleNamespace(), said.append)
-    assert accepted == [load]
-    assert [s.taken.candidate for s in left] == [load]
-    assert said == ["  left out again: payload"]
+    found, said = pruned(selection_of(payload, load), lost, expected=280.0)
+    assert found.accepted == (load.candidate,)
+    assert said == ["payload"]
+
+
+def test_reasons_of_an_earlier_search_stay_and_a_new_one_says_how_improbable_an_effect_is(pruned):
+    drag = trial("linear_drag", ("x",))
+    reason = "not determined: the flights make it probable with {:.2g} only"
+    selection = replace(selection_of(drag), left_out={"wind": reason.format(0.1)})
+    found, _ = pruned(selection, lambda accepted, c: (20.0, 0.0))
+    odds = np.exp(CONFIDENCE.intercept) * 21.0**CONFIDENCE.gain_power
+    assert found.left_out == {"wind": reason.format(0.1), "linear_drag": reason.format(odds / (1.0 + odds))}
+
+
+def test_what_the_balance_decides_stays_and_so_does_a_trim(pruned):
+    """Neither the filter's likelihood nor its odds count for them. The other effect is found after none or one."""
+    for kept in (trial("rotor_fault", ("scale",), log_odds=-3.0), trial("trim", ("x",))):
+        drag = trial("linear_drag", ("x",))
+        for nats, left in ((3.0, (kept.candidate,)), (500.0, (kept.candidate, drag.candidate))):
+            lost = {kept.candidate: 0.0, drag.candidate: nats}
+            found, _ = pruned(selection_of(kept, drag), lambda accepted, c, lost=lost: (lost[c], 0.0))
+            assert found.accepted == left
+
+
+def test_each_effect_is_judged_beside_all_the_others(monkeypatch):
+    """By the fit without it, and by the scatter of its own parameters."""
+    drag, scale = trial("linear_drag", ("x", "y", "z")), trial("thrust_scale", ("scale",))
+    bare = {c: (SimpleNamespace(loglik=-nats), -held) for c, nats, held in (
+        (drag.candidate, 30.0, 20.0), (scale.candidate, 700.0, 90.0))}  # fmt: skip
+    columns = []
+    monkeypatch.setattr(prune, "_fit_without", lambda data, held_out, fitted, accepted, c: bare[c])
+    monkeypatch.setattr(prune, "_expected", lambda held_out, fitted, accepted, c: 10.0 * len(c.free))
+    monkeypatch.setattr(prune, "held_out_fit", lambda *a: SimpleNamespace(loglik=4.0))
+    monkeypatch.setattr(
+        prune, "dispersion_of", lambda fitted, count, *, offset: columns.append((count, offset)) or 1.0 + count
+    )
+    data = SimpleNamespace(loglik=lambda point, passes: 1.0, workers=Workers(1))
+    found, without = prune.judged_again(data, SimpleNamespace(), selection_of(drag, scale))
+    assert without == [bare[drag.candidate][0], bare[scale.candidate][0]]
+    assert columns == [(3, 0), (1, 3)]
+    judged = [(s.taken.gain, s.taken.held_out, s.taken.expected, s.taken.dispersion) for s in found.steps[:-1]]
+    assert judged == [(31.0, 24.0, 30.0, 4.0), (701.0, 94.0, 10.0, 2.0)]
+    assert found.steps[-1].taken is None
+    assert found.accepted == (drag.candidate, scale.candidate)
 
 
 def test_one_number_at_the_end_of_its_range_is_no_finding():
@@ -228,11 +310,10 @@ def test_a_drag_that_no_air_has_stands_for_something_else():
 
 def test_wind_that_only_sinks_is_thrust_that_is_a_little_wrong():
     wind = Candidate("wind", (), ("x", "y", "z"))
-    trimmed = replace(DRONE, effects={"trim": dict.fromkeys("xyz", 0.0)})
     for vehicle, values, counts in (
         (DRONE, (0.05, 0.05, 3.0), False), (DRONE, (0.2, 0.0, 0.0), True),
-        (DRONE, (-0.11, 0.03, 1.7), False), (DRONE, (1.0, 1.0, 1.7), True), (trimmed, (0.2, 0.0, 0.0), False),
-        (trimmed, (0.9, 0.9, 0.0), True),
+        (DRONE, (-0.11, 0.03, 1.7), False), (DRONE, (1.0, 1.0, 1.7), True), (TRIMMED, (0.2, 0.0, 0.0), False),
+        (TRIMMED, (0.9, 0.9, 0.0), True),
     ):  # fmt: skip
         point = Point(vehicle, {"wind": dict(zip("xyz", values, strict=True))}, start_noise())
         assert exceeds_limit(point, wind) == counts
@@ -284,36 +365,21 @@ def test_beside_a_load_less_thrust_than_its_swing_leaves_open_of_its_weight_is_n
         assert exceeds_limit(POINT.with_effects({**load, **values}), candidate, data) == counts
 
 
-def test_a_load_is_as_significant_as_its_mass():
-    """A length far from the one where fits begin, and exactly known, says nothing where the mass may be 0."""
-    load = Candidate("suspended_load", (), ("mass", "length"))
-    point = POINT.with_effects({"suspended_load": {"mass": 1e-4, "length": 1.5}})
-    rng = np.random.default_rng(0)
-    for mass_sd, sure in ((1e-4, False), (1e-5, True)):
-        information = np.tile(np.diag([mass_sd**-2, 1e8]) / 40, (40, 1, 1))
-        score = rng.normal(size=(40, 2)) * np.sqrt(np.diag(information[0]))
-        score -= score.mean(axis=0)
-        gram = Gram(score, information, np.zeros(40, int))
-        fitted = Fitted(point, (load,), 0.0, gram, np.zeros(2))
-        assert (significance(fitted, 2, offset=0) < SELECTION.p_value) == sure
-
-
 def test_torques_and_inertias_are_fitted_together_or_not_at_all():
-    def entry(effect, gain, p_value=1e-6):
-        trial = Trial(Candidate(effect, (), ("x",)), gain, 0.0, 1.0, p_value, gain - 1.0)
-        return trial, None
+    def entry(effect, gain):
+        return Trial(Candidate(effect, (), ("x",)), gain, 0.0, 1.0, gain - 1.0), None
 
-    linear = [entry("torque_scale", 100.0), entry("linear_drag", 50.0), entry("inertia", 3.0, p_value=0.5)]
+    linear = [entry("torque_scale", 100.0), entry("linear_drag", 50.0), entry("inertia", 3.0)]
     assert [t.candidate.effect for t, _ in shortlist(linear)] == ["torque_scale", "linear_drag", "inertia"]
     assert [t.candidate.effect for t, _ in shortlist(linear[1:])] == ["linear_drag"]
 
 
 def test_heavy_rotors_are_fitted_beside_a_damping_from_where_they_are_heavy():
-    def entry(effect, gain, p_value=1e-6):
+    def entry(effect, gain):
         free = ("inertia",) if effect == "rotor_inertia" else ("x",)
-        return Trial(Candidate(effect, (), free), gain, 0.0, 1.0, p_value, gain - 1.0), None
+        return Trial(Candidate(effect, (), free), gain, 0.0, 1.0, gain - 1.0), None
 
-    damping, drag, rotors = entry("rate_damping", 200.0), entry("linear_drag", 50.0), entry("rotor_inertia", 0.0, 1.0)
+    damping, drag, rotors = entry("rate_damping", 200.0), entry("linear_drag", 50.0), entry("rotor_inertia", 0.0)
     *_, (trial, _) = shortlist([damping, drag, rotors])
     assert trial.candidate.effect == "rotor_inertia"
     begun = at_linear_size(POINT, trial.candidate, SimpleNamespace(theta=np.array([-1e-7])))
@@ -321,21 +387,3 @@ def test_heavy_rotors_are_fitted_beside_a_damping_from_where_they_are_heavy():
     assert [t.candidate.effect for t, _ in shortlist([drag, rotors])] == ["linear_drag"]
     found = [entry("rotor_inertia", 300.0), damping]  # by its derivative: once is enough
     assert sum(t.candidate.effect == "rotor_inertia" for t, _ in shortlist(found)) == 1
-
-
-@pytest.mark.parametrize(("left", "doubtful"), [(False, frozenset()), (True, frozenset({"linear_drag"}))])
-def test_an_effect_that_leaves_no_hump_is_not_doubted(monkeypatch, left: bool, doubtful: frozenset[str]) -> None:
-    """Beside the hump the effect is of another size; that counts only where a hump stays once the effect is there."""
-    hump = [SimpleNamespace(axis=0, frequency=4.0)]
-    drone = POINT.with_effects({"linear_drag": {"x": 0.02, "y": 0.02, "z": 0.02}})
-    monkeypatch.setattr(prune, "peaks", lambda model, point: hump if left or point is POINT else [])
-    monkeypatch.setattr(prune, "nuisances", lambda data, point, accepted: ())
-
-    def gram(move: float) -> Gram:
-        scores = np.random.default_rng(1).normal(100.0 * move, 10.0, (30, 3))
-        return Gram(scores, np.broadcast_to(1e4 * np.eye(3), (30, 3, 3)), np.zeros(30, int))
-
-    monkeypatch.setattr(prune, "off_peak_gram", lambda data, point, columns, found: gram(-1.0))
-    data = SimpleNamespace(models=[None], gram=lambda point, columns: gram(0.0))
-    fitted = SimpleNamespace(point=drone, precision=np.zeros(3))
-    assert prune.vibration_look_alikes(data, POINT, fitted, [DRAG], lambda text: None) == doubtful  # type: ignore[arg-type]

@@ -8,7 +8,6 @@ import pytest
 from closed_loop import DRONE, SIGNS, fly
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Noise, Point
 from crazyem.diagnosis.fitting.noise import start_noise
@@ -20,12 +19,9 @@ from crazyem.diagnosis.locating.random_torques import (
     hump,
     humps,
     memoryless,
-    off_peak_gram,
     peaks,
-    reach_of,
     spectrum,
 )
-from crazyem.diagnosis.settings import SPECTRUM
 
 ROWS, STEP = 2500, 0.01
 
@@ -111,18 +107,9 @@ def test_noise_has_no_hump() -> None:
     assert not peaks(model_of(np.ones((300, 3))), POINT)  # too short for a spectrum
 
 
-@pytest.mark.parametrize(("half", "wanted"), [(0.1, 0.5), (1.2, 1.2), (5.0, SPECTRUM.max_hump_width)])
-def test_a_hump_reaches_as_far_as_it_stands_out(half: float, wanted: float) -> None:
-    """A hat of twenty times its surroundings, some hertz to either side."""
-    frequency = np.arange(0.0, 50.0, 0.1)
-    power = np.where(np.abs(frequency - 8.0) < half, 20.0, 1.0)
-    k = int(np.argmin(np.abs(frequency - 8.0)))
-    assert reach_of(frequency, power, k, 20.0) == pytest.approx(wanted, abs=0.11)
-
-
 @pytest.mark.slow
 def test_a_flight_that_shakes() -> None:
-    """3 rad/s^2 in roll and pitch about 6 Hz: found there with its torque; beside the hump little is known of it."""
+    """3 rad/s^2 in roll and pitch about 6 Hz: found there with its torque."""
     data = Data([flight_of(fly(vibration=3.0), DRONE)])
     point = nominal(data, Point(DRONE, {}, start_noise()))
     found = humps(data.models[0], point)
@@ -131,10 +118,6 @@ def test_a_flight_that_shakes() -> None:
         assert 5.5 < float(f.regime.split()[1]) < 6.5
         assert f.effect_size == pytest.approx(3.0 * inertia, rel=0.3)
     assert amplitude_of(data.models[0], point, 2, 6.0)[0] < 0.5
-    columns = Candidate("torque_scale", (), ("scale",)).columns(point)
-    whole = off_peak_gram(data, point, columns, [[]])
-    beside = off_peak_gram(data, point, columns, [peaks(data.models[0], point)])
-    assert 0 < beside.information.sum() < whole.information.sum()
 
 
 def test_a_healthy_made_flight_has_neither() -> None:

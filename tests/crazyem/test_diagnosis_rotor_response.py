@@ -40,10 +40,12 @@ def answering(
     seed: int = 0,
     noise: float = 0.0,
     sticks: Mapping[int, float] = NONE,
+    drop: float = 0.0,
 ) -> Recording:
     """Commands of a controller at 500 Hz, of which every fifth is logged, and what rotors make of all of them.
 
     sticks: rotors (1 to 4) that heed no change of their command up to this.
+    drop: V per N^1.5 of all rotors, by which a battery of 4 V drops at once; it is measured every 0.1 s.
     """
     rng = np.random.default_rng(seed)
     start, end = flown.signals["motor_command"].time[[0, -1]]
@@ -57,34 +59,56 @@ def answering(
         for k in range(1, len(heeded)):
             if abs(command[k, rotor - 1] - heeded[k - 1, rotor - 1]) < band:
                 heeded[k, rotor - 1] = heeded[k - 1, rotor - 1]
-    wanted = 0.06 * heeded + 0.08 * heeded**2  # N
     behind = round(late / step)
-    acting = np.vstack([np.repeat(wanted[:1], behind, axis=0), wanted[: len(wanted) - behind]])
-    thrust = np.empty_like(acting)
-    thrust[0] = acting[0]
+    acting = np.vstack([np.repeat(heeded[:1], behind, axis=0), heeded[: len(heeded) - behind]])
+    thrust, volts = np.empty_like(acting), np.full(len(acting), 4.0)
+    thrust[0] = 0.06 * acting[0] + 0.08 * acting[0] ** 2  # N
     for k in range(1, len(acting)):
-        thrust[k] = acting[k - 1] + (thrust[k - 1] - acting[k - 1]) * np.exp(-step / lag)
+        duty = acting[k - 1] * volts[k - 1] / 4.0
+        goal = 0.06 * duty + 0.08 * duty**2
+        thrust[k] = goal + (thrust[k - 1] - goal) * np.exp(-step / lag)
+        volts[k] -= drop * np.sum(thrust[k] ** 1.5)
     speed = np.sqrt(thrust / 2e-8) * (1 + noise * rng.normal(size=thrust.shape))
     signals = {
         **flown.signals,
         "motor_command": array_of("motor_command", time[::5], command[::5], place=80),
         "rotor_speed": array_of("rotor_speed", time[::5], speed[::5], place=90),
+        "voltage": array_of("voltage", time[::50], volts[::50], place=95),
     }
     return replace(flown, signals=signals)
 
 
 @pytest.mark.parametrize(("lag", "late"), [(0.015, 0.0), (0.03, 0.006), (0.03, 0.0), (0.06, 0.01)])
 def test_lag_and_delay_are_those_of_the_rotors(flown, lag, late):
-    found = response(answers([answering(flown, lag, late)], ROTORS))
-    assert found is not None
-    assert found.lag == pytest.approx(lag, rel=0.06)
-    assert found.delay == pytest.approx(late, abs=2e-3)  # a command is held for 2 ms
+    found = [response(answers([answering(flown, lag, late, seed=s)], ROTORS)) for s in range(5)]
+    assert np.mean([f.lag for f in found if f]) == pytest.approx(lag, rel=0.03)
+    assert np.mean([f.delay for f in found if f]) == pytest.approx(late, abs=1e-3)
+    assert all(f is not None and abs(f.lag - lag) < 3.0 * f.covariance[0, 0] ** 0.5 for f in found)
 
 
-def test_noise_of_speeds_does_not_make_rotors_look_quick(flown):
-    found = response(answers([answering(flown, 0.05, 0.0, noise=0.01)], ROTORS))
+@pytest.mark.parametrize("seed", [1, 2])
+def test_noise_of_speeds_does_not_make_rotors_look_quick(flown, seed):
+    found = response(answers([answering(flown, 0.05, 0.0, seed=seed, noise=0.01)], ROTORS))
     assert found is not None
     assert found.lag == pytest.approx(0.05, rel=0.06)
+
+
+@pytest.mark.parametrize("lag", [0.03, 0.05])
+def test_a_voltage_that_drops_under_the_load_does_not_make_rotors_look_quick(flown, lag):
+    made = answering(flown, lag, 0.0, seed=1, drop=12.0)  # a hover takes a quarter of the voltage
+    found = response(answers([made], ROTORS))
+    assert found is not None
+    assert found.lag == pytest.approx(lag, rel=0.06)
+    assert found.delay == pytest.approx(0.0, abs=2e-3)
+
+
+def test_without_a_voltage_a_rotor_that_sticks_is_found_and_no_lag(flown):
+    made = [answering(flown, 0.03, 0.0, seed=s, sticks={2: 0.1}) for s in (0, 1)]
+    bare = [replace(m, signals={n: a for n, a in m.signals.items() if n != "voltage"}) for m in made]
+    assert response(answers(bare, ROTORS)) is None
+    sticking = unresponsive_rotor(answers(bare, ROTORS))
+    assert sticking is not None
+    assert sticking.regime == "rotor 2 does not follow its command"
 
 
 def test_what_does_not_answer_says_nothing(flown):
@@ -109,13 +133,14 @@ def test_a_lag_or_a_delay_or_both_are_named():
     assert slow is not None
     assert slow.values == {"motor_lag": (pytest.approx(0.045), pytest.approx(1.4e-3))}
     assert slow.nats == pytest.approx(0.5 * (0.015 / 1.4e-3) ** 2)
-    late = late_response(found(0.03, 0.008), None, ROTORS)
+    late = late_response(found(0.03, 6.0 * ROTOR_RESPONSE.delay_sd), None, ROTORS)
     assert late is not None
     assert list(late.values) == ["input_delay"]
-    both = late_response(found(0.045, 0.008), None, ROTORS)
+    both = late_response(found(0.045, 6.0 * ROTOR_RESPONSE.delay_sd), None, ROTORS)
     assert both is not None
     assert set(both.values) == {"motor_lag", "input_delay"}
-    assert late_response(found(0.03, -0.008), None, ROTORS) is None  # no rotor answers before it is told to
+    # no rotor answers before it is told to
+    assert late_response(found(0.03, -6.0 * ROTOR_RESPONSE.delay_sd), None, ROTORS) is None
 
 
 def test_flights_held_out_must_agree():

@@ -73,3 +73,19 @@ def test_what_is_remembered_is_of_the_last_path():
             np.testing.assert_array_equal(model.offsets(point, found), forgetful.offsets(point, expected))
         there.append(model.offsets(point, found))
     assert not np.array_equal(*there)  # or nothing was asked
+
+
+def test_what_a_filter_shows_is_remembered_by_the_tilt_before_it():
+    """Two tilts of the pose in turns, under one model: each time as from a model that remembers nothing."""
+    model = Model(replace(flight_of(fly(seconds=5.0), DRONE), fused=True))
+    effects = {"onboard_filter": {"lateral_time_constant": 0.2}, "linear_drag": {"x": 0.01, "y": 0.01}}
+    point = Point(DRONE, effects, start_noise())
+    model.settle(point)
+    acceleration, _ = model.accelerations(point)
+    shown = []
+    for roll in (0.0, 0.02, 0.0, 0.02):
+        tilted = {**effects, "attitude_misalignment": {"roll": roll, "pitch": 0.0}}
+        shown.append(model.offsets(point, acceleration, tilted))
+        plain = replace(model, _offsets={}).offsets(point, acceleration, tilted)
+        np.testing.assert_array_equal(shown[-1], plain)
+    assert np.abs(shown[1][:, 3:6] - shown[0][:, 3:6]).max() > 1e-3  # m/s, or nothing was asked

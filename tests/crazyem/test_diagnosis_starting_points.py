@@ -101,9 +101,7 @@ def test_a_load_that_is_followed_only_by_one_as_heavy_is_begun_with_its_mass(hei
 
 def test_what_is_begun_by_its_likelihood_is_tried_whatever_derivatives_say():
     def entry(name, gain, **begun):
-        return Trial(
-            Candidate(name, (), ("mass",), **begun), gain, 0.0, 1.0, 1e-6 if gain > 0 else 1.0, gain - 1.0
-        ), None
+        return Trial(Candidate(name, (), ("mass",), **begun), gain, 0.0, 1.0, gain - 1.0), None
 
     others = [entry(n, g) for n, g in (("payload", 90.0), ("wind", 80.0), ("thrust_scale", 70.0))]
     load = entry("suspended_load", -5.0, likeliest=True)

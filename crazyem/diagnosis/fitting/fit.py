@@ -120,19 +120,20 @@ class Data:
         """Evaluate the physics at the states of the filter."""
         return self.workers.map(lambda m: m.settle(point), self.models)
 
-    def converge(self, point: Point) -> None:
-        """Repeat passes until the physics is evaluated at the states of the filter.
+    def converged(self, point: Point, columns: Sequence[Column]) -> tuple[Gram, float]:
+        """`gram_and_loglik`, with passes before it until the physics is evaluated at the states of the filter.
 
-        Only with an effect that is `has_large_offset`; otherwise one pass is enough.
+        Only with an effect that is `has_large_offset` more than one pass is needed.
         """
         if not any(has_large_offset(name, values) for name, values in point.effects.items()):
-            return
-        before = self.loglik(point)
+            return self.gram_and_loglik(point, columns)
+        self.loglik(point)
         for _ in range(FITTING.passes):
-            now = self.loglik(point)
+            before = self.loglik(point)
+            gram, now = self.gram_and_loglik(point, columns)
             if abs(now - before) < FITTING.pass_change:
                 break
-            before = now
+        return gram, now
 
     def fit_noise(self, point: Point, *, near: bool = False) -> Point:
         """The model with fitted noise scales; `near`: the start values are near the maximum."""
@@ -325,8 +326,7 @@ def refine(
         return np.array([0.0] * own + apart)
 
     def look(at: Point) -> tuple[float, Gram]:
-        data.converge(at)
-        gram, loglik = data.gram_and_loglik(at, [column for c in free for column in c.columns(at)])
+        gram, loglik = data.converged(at, [column for c in free for column in c.columns(at)])
         return loglik + log_prior(away(at), weight, freedom), gram
 
     data.loglik(point)  # from here on, the physics is evaluated at the states of the filter
@@ -339,7 +339,10 @@ def refine(
         local = local_precision(away(point), weight, freedom)
         best = gram.solve(range(gram.size), low=low, high=high, precision=local, prior=-away(point))
         before = value
-        for k in range(FITTING.tries if best.gain > FITTING.min_step_gain else 0):
+        near = best.gain < FITTING.min_round_gain
+        if near:  # the linear approximation is exact enough
+            point, value, gram = with_change(point, free, best.theta), value + best.gain, gram.moved(best.theta)
+        for k in range(0 if near else FITTING.tries):
             there = with_change(point, free, best.theta / 3**k)
             found, slopes = look(there)
             if found > value - 1e-6:

@@ -7,11 +7,10 @@ blocks (the sandwich; White 1982), not from the information alone.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from crazyem.diagnosis.settings import FITTING
 
@@ -24,7 +23,6 @@ class Solution:
         theta: (k,) change of the parameters.
         gain: log-likelihood gained [nats].
         held_out: the same on blocks that were not used for the fit, summed over folds [nats].
-        p_value: of the test that all are 0, from the scatter of the scores of the blocks.
         covariance: (k, k), the sandwich, scaled so that no variance is smaller than that of the inverse information.
         dispersion: variance of the scores of the tested columns over that of the model, the other columns profiled out.
     """
@@ -32,7 +30,6 @@ class Solution:
     theta: NDArray
     gain: float
     held_out: float
-    p_value: float
     covariance: NDArray
     dispersion: float
 
@@ -49,6 +46,10 @@ class Gram:
     def size(self) -> int:
         """Number of columns."""
         return self.score.shape[1]
+
+    def moved(self, change: NDArray) -> "Gram":
+        """Score and information after a small change (c,) of the parameters."""
+        return replace(self, score=self.score - self.information @ change)
 
     def fold_of(self) -> NDArray:
         """(b,) fold of each block: chunks of blocks dealt out in turn."""
@@ -77,7 +78,7 @@ class Gram:
             columns: indices (k,).
             precision: (k,) of Gaussian priors around `prior` (default 0); 0: none.
             low, high: (k,) bounds of the change.
-            tested: positions (of the k) that the p-value tests; default all.
+            tested: positions (of the k) whose scores the dispersion is of; default all.
             effective: degrees of freedom are those that the blocks determine (`used`), instead of k.
         """
         c = np.asarray(columns, int)
@@ -98,17 +99,10 @@ class Gram:
             t = bounded(a - a_out + np.diag(weight), b - b_out + weight * centre, low, high)
             held += float(b_out @ t - 0.5 * t @ a_out @ t)
         which = np.arange(k) if tested is None else np.asarray(tested, int)
-        total, curvature, free = b + weight * centre, a + np.diag(weight), np.zeros(k, bool)
+        curvature = a + np.diag(weight)
         covariance, meat = self._sandwich(scores, infos, theta, curvature, effective)
         dispersion = self._dispersion(a, curvature, meat, which, len(scores))
-        p_value = self._p_value(total, infos, curvature, meat, which, free, len(scores))
-        if low is not None and high is not None and which.size < k:
-            # Evidence against the absence of an effect with free other columns counts within bounds, too. With other
-            # columns at their bounds there may be more evidence.
-            rest, fast = _without_columns(curvature, total, low, high, which)
-            if fast.any():
-                p_value = min(p_value, self._p_value(rest, infos, curvature, meat, which, fast, len(scores)))
-        return Solution(theta, gain, held, p_value, covariance, dispersion)
+        return Solution(theta, gain, held, covariance, dispersion)
 
     def by_flights(self, theta: NDArray, precision: NDArray) -> tuple[NDArray, int]:
         """Standard deviations (c,) of all columns from the scatter of the scores of flights, and degrees of freedom.
@@ -165,34 +159,6 @@ class Gram:
         taken = min(used(a, curvature), blocks - 2) if which.size < len(a) else 0.0
         return float(np.median(by_scatter[left] / by_model[left])) * blocks / (blocks - max(taken, 0.0))
 
-    @staticmethod
-    def _p_value(
-        total: NDArray, infos: NDArray, a: NDArray, meat: NDArray, which: NDArray, held_fast: NDArray, blocks: int
-    ) -> float:
-        """Score test of the tested columns by the scatter of the blocks, the others profiled out.
-
-        `total` is the score with the gradient of the priors, at the model without the tested columns; at a maximum, it
-        is zero for the other columns. Without the priors, nuisances that have moved to explain a missing effect would
-        count against the effect. A column that is `held_fast` (k,) by a bound is not profiled out, because it cannot
-        move.
-        """
-        k = which.size
-        if k == 0:
-            return 1.0
-        others = np.setdiff1d(np.flatnonzero(~held_fast), which)
-        project = _profiled(a, which, others)
-        b = project @ total
-        v = project @ meat @ project.T
-        plain = project @ infos.sum(0) @ project.T
-        scale = np.sqrt(np.maximum(np.diag(plain), 1e-300))
-        v, plain, b = v / np.outer(scale, scale), plain / np.outer(scale, scale), b / scale
-        # scores that scatter less than by the model do so by chance, because blocks are few
-        values, vectors = np.linalg.eigh(v)
-        floor = np.maximum(values, np.einsum("ij,jk,ki->i", vectors.T, plain, vectors))
-        t2 = float(np.sum((vectors.T @ b) ** 2 / np.maximum(floor, 1e-9)))
-        freedom = max(blocks - k, 1)
-        return float(stats.f.sf(t2 * freedom / (k * max(blocks - 1, 1)), k, freedom))
-
 
 def _inverse(curvature: NDArray) -> NDArray:
     """Inverse of a curvature (k, k) of columns of very different sizes."""
@@ -211,14 +177,6 @@ def _profiled(a: NDArray, which: NDArray, others: NDArray) -> NDArray:
             a[np.ix_(others, others)] + np.diag(1e-12 * own + (own <= 0)), a[np.ix_(others, which)]
         ).T
     return project
-
-
-def _without_columns(a: NDArray, b: NDArray, low: NDArray, high: NDArray, which: NDArray) -> tuple[NDArray, NDArray]:
-    """The score (k,) at the maximum within bounds without the columns `which`; the other columns at a bound (k,)."""
-    absent = np.isin(np.arange(b.size), which)
-    low, high = np.where(absent, 0.0, low), np.where(absent, 0.0, high)
-    without = bounded(a, b, low, high)
-    return b - a @ without, ~absent & ((without <= low) | (without >= high))
 
 
 def used(information: NDArray, posterior: NDArray) -> float:

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 
 from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate, of_recordings
 from crazyem.diagnosis.fitting.conditions import conditions_of
@@ -118,7 +117,7 @@ def with_trim_noise(data: Data, point: Point) -> Point:
     """The point with noise that was fitted with a free trim, so that a steady torque is not fitted as noise.
 
     The steady torque of a weak rotor is many times the trim of a day. Without the effect in the model, the noise scales
-    would grow until they explain this torque, and the effect would not be significant. For a vehicle file with a trim
+    would grow until they explain this torque, and the effect would gain little. For a vehicle file with a trim
     only.
     """
     if TRIM not in point.vehicle.effects:
@@ -147,17 +146,6 @@ def solved(fitted: Fitted, *, wide: bool = False) -> tuple[Solution, float]:
     solution = gram.solve(range(gram.size), precision=precision, effective=True)
     information = gram.total(range(gram.size))[1]
     return solution, used(information, information + np.diag(precision))
-
-
-def p_value_by_gain(point: Point, gain: float, count: int, blocks: int, p_value: float) -> float:
-    """The p-value of `count` parameters; with a trim in the file, from `gain`, nats over their own dispersion.
-
-    With a trim there are some 20 nuisances, more than blocks in a short flight. Then the scatter of the scores of
-    blocks, with the nuisances profiled out, says nothing.
-    """
-    if TRIM not in point.vehicle.effects:
-        return p_value
-    return float(stats.f.sf(2.0 * max(gain, 0.0) / count, count, max(blocks - 1, 1)))
 
 
 def can_be_finding(candidate: Candidate) -> bool:

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from crazyem.diagnosis.fitting.fit import Data
-from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Column, Model, Point
 from crazyem.diagnosis.locating.locate import AXES, Finding, units_of
 from crazyem.diagnosis.settings import LOCATION, SPECTRUM
@@ -129,14 +128,12 @@ def hump(frequency: NDArray, power: NDArray) -> tuple[int, float]:
 
 
 class Peak(NamedTuple):
-    """A hump: axis 0 to 2, frequency [Hz], power over that of the surroundings, number of pieces of the spectrum, and
-    reach to either side [Hz]."""
+    """A hump: axis 0 to 2, frequency [Hz], power over that of the surroundings, number of pieces of the spectrum."""
 
     axis: int
     frequency: float
     ratio: float
     pieces: int
-    reach: float = 0.5
 
 
 def peaks(model: Model, point: Point) -> list[Peak]:
@@ -152,55 +149,8 @@ def peaks(model: Model, point: Point) -> list[Peak]:
         if pieces >= SPECTRUM.min_pieces:
             k, ratio = hump(frequency, power)
             if ratio > SPECTRUM.min_hump:
-                found.append(Peak(i, float(frequency[k]), ratio, pieces, reach_of(frequency, power, k, ratio)))
+                found.append(Peak(i, float(frequency[k]), ratio, pieces))
     return found
-
-
-def reach_of(frequency: NDArray, power: NDArray, k: int, ratio: float) -> float:
-    """Reach of a hump to either side [Hz], where its power falls to `SPECTRUM.hump_end` times that of the surroundings.
-
-    The frequency of a vibration by a rotor varies with the speed of the rotor.
-    """
-    low = power < SPECTRUM.hump_end / ratio * power[k]
-    below, above = np.flatnonzero(low[:k]), np.flatnonzero(low[k:])
-    left = frequency[k] - frequency[below[-1]] if below.size else 0.0
-    right = frequency[k + above[0]] - frequency[k] if above.size else 0.0
-    return float(np.clip(max(left, right), 0.5, SPECTRUM.max_hump_width))
-
-
-def off_peak_gram(data: Data, point: Point, columns: Sequence[Column], found: Sequence[Sequence[Peak]]) -> Gram:
-    """Score and information of columns outside the humps of each flight.
-
-    Torques at the frequencies of the humps, with free amplitude and phase in every second, are profiled out.
-    """
-    score, information, flight = [], [], []
-    m = len(columns)
-    for k, (model, here) in enumerate(zip(data.models, found, strict=True)):
-        seconds = np.unique(np.floor(model.flight.time - model.flight.time[0]), return_inverse=True)[1]
-        by_seconds = replace(model, flight=replace(model.flight, block=seconds.astype(np.int64)))
-        swept = by_seconds.sweep(point, [*columns, *(w for p in here for w in waves(model, p))])
-        b, a = swept.score, swept.information
-        if here:
-            own = np.einsum("bii->bi", a[:, m:, m:])
-            inner = a[:, m:, m:] + np.einsum("bi,ij->bij", 1e-6 * own + (own <= 0), np.eye(own.shape[1]))
-            gain = np.linalg.solve(inner, a[:, m:, :m])  # (b, w, m)
-            b, a = b[:, :m] - np.einsum("bwm,bw->bm", gain, b[:, m:]), a[:, :m, :m] - a[:, :m, m:] @ gain
-        score.append(b)
-        information.append(a)
-        flight.append(np.full(len(b), k))
-    return Gram(np.concatenate(score), np.concatenate(information), np.concatenate(flight))
-
-
-def waves(model: Model, peak: Peak) -> list[Column]:
-    """Columns of torques about the axis of a hump: sine and cosine at frequencies 0.5 Hz apart, over its reach."""
-    columns = []
-    count = round(peak.reach / 0.5)
-    for at in peak.frequency + 0.5 * np.arange(-count, count + 1):
-        for wave in (np.cos, np.sin):
-            acting = np.zeros((model.flight.time.size, 6))
-            acting[:, 3 + peak.axis] = wave(2 * np.pi * at * model.flight.time)
-            columns.append(Column("wave", acting=acting))
-    return columns
 
 
 def humps(model: Model, point: Point) -> list[Finding]:
@@ -211,7 +161,7 @@ def humps(model: Model, point: Point) -> list[Finding]:
     span = (float(flight.time[0]), float(flight.time[-1]))
     least = LOCATION.torque * point.vehicle.mass * GRAVITY * max(*point.vehicle.arm, 0.01)
     found = []
-    for i, at, ratio, pieces, _ in peaks(model, point):
+    for i, at, ratio, pieces in peaks(model, point):
         amplitude, sd = amplitude_of(model, point, i, at)
         if model.rows_path is None:  # the model left the range of numbers
             continue

@@ -21,7 +21,7 @@ EFFECT = ACCELEROMETER_MISALIGNMENT.name
 ANGLES = ("roll", "pitch", "yaw")
 
 
-def tilt(data: Data, point: Point) -> tuple[Solution, Gram] | None:
+def tilt(data: Data, point: Point) -> Solution | None:
     """Angles (roll, pitch, yaw first in theta) of the accelerometer [rad]; None without one."""
     if "specific_force" not in data.signals:
         return None
@@ -35,7 +35,7 @@ def tilt(data: Data, point: Point) -> tuple[Solution, Gram] | None:
     )
     solution = gram.solve(range(7), precision=precision, tested=range(2))
     more = np.diag([ACCELEROMETER.angle_sd**2] * 2 + [0.0] * 5)
-    return replace(solution, covariance=solution.covariance + more), gram
+    return replace(solution, covariance=solution.covariance + more)
 
 
 def held_out_gain(data: Data, point: Point, angles: NDArray, *, yaw_sd: float) -> float:
@@ -66,7 +66,7 @@ def _fitted(score: NDArray, information: NDArray, known: Mapping[int, float]) ->
 def gram_dispersion(data: Data, point: Point) -> float:
     """Variance of the scores over that of white residuals; at least 1."""
     found = tilt(data, point)
-    return max(1.0, found[0].dispersion) if found else 1.0
+    return max(1.0, found.dispersion) if found else 1.0
 
 
 def _of(model: Model, point: Point) -> Gram:

@@ -15,7 +15,7 @@ from crazyem.diagnosis.fitting.fit import Data, DivergedError
 from crazyem.diagnosis.fitting.nuisances import refine_base, refine_with_memory, without
 from crazyem.diagnosis.naming.detection_limits import exceeds_limit, is_implausible
 from crazyem.diagnosis.naming.load_or_rotors import occam_cost_of, refitted
-from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, margin, undominated
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, margin
 from crazyem.diagnosis.settings import SELECTION
 
 
@@ -39,15 +39,11 @@ def with_better_rivals(
 def close_alternatives(
     step: Step, accepted: Sequence[Candidate], *, near: float = SELECTION.rival_difference
 ) -> list[Trial]:
-    """Significant rivals within `near` nats of the effect when it was taken, which are not in the model now."""
+    """Admissible rivals within `near` nats of the effect when it was taken, which are not in the model now."""
     taken, names = step.taken, {c.effect for c in accepted}
     assert taken is not None
     tried = [t for t in step.trials if t.fitted is not None and t.blocks.size == taken.blocks.size]
-    return [
-        t
-        for t in tried
-        if t.candidate.effect not in names and t.p_value < SELECTION.p_value and margin(taken, t)[0] < near
-    ]
+    return [t for t in tried if t.candidate.effect not in names and t.admissible and margin(taken, t)[0] < near]
 
 
 def _reselected(
@@ -77,25 +73,21 @@ def _reselected(
     now, tried = tried[0], tried[1:]
     asked = tried if ended else [now, *tried]
     best = max(asked, key=lambda t: t.worth)
-    equals = [t for t in asked if t is best or not distinguishable(best, t, recordings=False)]
-    group = [t for t in asked if t is best or not distinguishable(best, t)]
-    unbeaten = undominated(equals)
-    chosen = min(unbeaten, key=lambda t: (len(t.candidate.free), -t.value), default=best)
     rest = [t for t in step.trials if t is not step.taken and all(t.candidate is not r.candidate for r in tried)]
-    trials = (*asked, *rest)  # an effect at the end of its range is no rival
-    if any(t is now for t in unbeaten) and len(chosen.candidate.free) == len(mine.free):
-        chosen = now
-    alike = tuple(t for t in group if t is not chosen and t.candidate.effect != chosen.candidate.effect)
-    steps = tuple(replace(step, taken=chosen, trials=trials, alike=alike) if s is step else s for s in selection.steps)
-    if chosen is now:
+    alike = [t for t in asked if t is not best and not distinguishable(best, t)]
+    alike = [t for t in alike if t.candidate.effect != best.candidate.effect]
+    # an effect at the end of its range is no rival
+    after = replace(step, taken=best, trials=(*asked, *rest), alike=tuple(alike))
+    steps = tuple(after if s is step else s for s in selection.steps)
+    if best is now:
         return replace(selection, steps=steps)
-    accepted = _in_place(selection.accepted, mine, chosen.candidate)
-    assert chosen.fitted is not None
-    values = {chosen.candidate.effect: chosen.candidate.values(chosen.fitted.point)}
+    accepted = _in_place(selection.accepted, mine, best.candidate)
+    assert best.fitted is not None
+    values = {best.candidate.effect: best.candidate.values(best.fitted.point)}
     fitted = refine_with_memory(data, without(selection.final, name).with_effects(values), accepted)
-    if not exceeds_limit(fitted.point, chosen.candidate, data):
+    if not exceeds_limit(fitted.point, best.candidate, data):
         return selection
-    say(f"  beside the others it is {chosen.candidate.label}")
+    say(f"  beside the others it is {best.candidate.label}")
     return replace(selection, final=fitted.point, fitted=fitted, accepted=tuple(accepted), steps=steps)
 
 

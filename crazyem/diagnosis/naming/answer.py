@@ -18,14 +18,13 @@ from crazyem.diagnosis.naming.balance import steady as steadily
 from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, load_substitutes
 from crazyem.diagnosis.naming.named import Named, Value, confidence_factor, one_factor
 from crazyem.diagnosis.naming.steady_odds import decided_by_balance
-from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, preferred, wald
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, preferred
 from crazyem.diagnosis.naming.unexplained import Unexplained
-from crazyem.diagnosis.settings import CONFIDENCE, LOADS, SELECTION
+from crazyem.diagnosis.settings import LOADS, SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.mass_properties import ON_BOARD
 from crazyem.physics.effects.rotors import ROTOR_FAULT
 
-SHAKES = "hold the drone with its rotors turning: what shakes then is not the loop that swings with a wrong model"
 # A thrust scale gives the same signals as two changes, mass and inertias by one factor, except for forces of the air.
 HEAVIER = "weigh the drone: with {:.3g} times its mass and its inertias it would fly the same"
 
@@ -63,8 +62,8 @@ def answer_of(
     """
     if not selection.accepted:
         return Answer()
-    point, gram = selection.final, selection.fitted.gram
-    _, _, all_covariance, used = _uncertainty(selection.fitted)
+    point = selection.final
+    _, _, all_covariance = _uncertainty(selection.fitted)
     numbers = numbers_of(data, selection, balance)
     found: list[tuple[tuple[float, float], Named]] = []
     groups: list[tuple[str, ...]] = []
@@ -76,30 +75,21 @@ def answer_of(
         assert step.taken is not None
         own = slice(at, at + len(candidate.free))
         at = own.stop
-        away, covariance = _away(candidate, point), all_covariance[own, own]
+        covariance = all_covariance[own, own]
         rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, selection, corroborated), balance)
         against = _against(remains, candidate, data)
         there = step.taken.presence(order)
         there *= confidence_factor(against, step.taken.held_out) if step.taken.log_odds is None else 1.0
         confidence = there * preferred(step.taken, rivals)
         confidence /= 1.0 + sum(float(np.exp(-nats)) for nats in steady.values())
-        doubtful = candidate.effect in selection.doubtful
-        by_day = _by_the_day(candidate, point, balance)
-        none_of_it = wald(away, covariance, gram, used) if by_day is None else by_day[1]
-        if doubtful or none_of_it > CONFIDENCE.neutral_p:
-            confidence = min(confidence, CONFIDENCE.doubtful)
-        p_value = min(1.0, step.taken.p_value * max(1, selection.tried))
         # late inputs and late measurements are one model: fitted as the former, named by corroboration
         effect = CATALOGUE[candidate.effect]
         late = next((n for n in effect.same_as if n in corroborated), None)
         name, label = (late, late) if late else (candidate.effect, candidate.label)
         chosen = dict(effect.same_as[late] if late else candidate.fixed)
         odds = float(logit(there))
-        named = Named(name, label, parameters, chosen, step.taken.held_out, p_value, confidence, candidate.effect, odds)
+        named = Named(name, label, parameters, chosen, step.taken.held_out, confidence, candidate.effect, odds)
         found.append(((-there, -step.taken.evidence), named))
-
-        if doubtful:
-            separate.append(SHAKES)
         equal = [
             *(t.candidate.effect for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}),
             *(name for name, nats in steady.items() if nats < SELECTION.separating),
@@ -121,7 +111,7 @@ def answer_of(
 
 def numbers_of(data: Data, selection: Selection, balance: Balance | None) -> list[dict[str, Value]]:
     """Values with intervals of the free parameters of each selected effect, in the order of the effects."""
-    sd, width, _, _ = _uncertainty(selection.fitted)
+    sd, width, _ = _uncertainty(selection.fitted)
     never = systematic_sd(data, selection.final)
     never |= {
         name: float(np.hypot(never.get(name, 0.0), off)) for name, off in error_by_lag(data, selection.fitted).items()
@@ -131,7 +121,7 @@ def numbers_of(data: Data, selection: Selection, balance: Balance | None) -> lis
         own = slice(at, at + len(candidate.free))
         at = own.stop
         by_day = _by_the_day(candidate, selection.final, balance)
-        found.append(by_day[0] if by_day else _numbers(candidate, selection.final, sd[own], width[own], never))
+        found.append(by_day if by_day else _numbers(candidate, selection.final, sd[own], width[own], never))
     return found
 
 
@@ -158,14 +148,9 @@ def _against(remains: Unexplained, candidate: Candidate, data: Data) -> Unexplai
     return remains
 
 
-def _away(candidate: Candidate, point: Point) -> NDArray:
-    values, neutral = candidate.values(point), candidate.neutral(point)
-    return np.array([values[n] - neutral[n] for n in candidate.free])
-
-
-def _uncertainty(fitted: Fitted) -> tuple[NDArray, NDArray, NDArray, float]:
-    """Standard deviations (k,) of all free parameters, half-widths of 95 % intervals in standard deviations (k,),
-    covariance (k, k), and degrees of freedom that the parameters take.
+def _uncertainty(fitted: Fitted) -> tuple[NDArray, NDArray, NDArray]:
+    """Standard deviations (k,) of all free parameters, half-widths of 95 % intervals in standard deviations (k,), and
+    covariance (k, k).
 
     By the scatter of blocks, or by the scatter of flights where the latter makes the interval wider.
     """
@@ -174,11 +159,11 @@ def _uncertainty(fitted: Fitted) -> tuple[NDArray, NDArray, NDArray, float]:
     width = np.full(sd.size, stats.t.ppf(0.975, max(len(fitted.gram.score) - used, 3)))
     apart, freedom = fitted.gram.by_flights(solution.theta, fitted.precision)
     if not freedom:
-        return sd, width, solution.covariance, used
+        return sd, width, solution.covariance
     wider = stats.t.ppf(0.975, freedom) * apart > width * sd
     width = np.where(wider, stats.t.ppf(0.975, freedom), width)
     larger = np.where(wider, np.maximum(apart / np.maximum(sd, 1e-300), 1.0), 1.0)
-    return sd * larger, width, solution.covariance * np.outer(larger, larger), used
+    return sd * larger, width, solution.covariance * np.outer(larger, larger)
 
 
 def _numbers(
@@ -198,9 +183,9 @@ def _numbers(
     return out
 
 
-def _by_the_day(candidate: Candidate, point: Point, balance: Balance | None) -> tuple[dict[str, Value], float] | None:
-    """Values of a weak rotor or a load by the balance, and the p-value that there is none; None for other effects and
-    without a balance. Differences between days are the largest part of the error."""
+def _by_the_day(candidate: Candidate, point: Point, balance: Balance | None) -> dict[str, Value] | None:
+    """Values of a weak rotor or a load by the balance; None for other effects and without a balance. Differences
+    between days are the largest part of the error."""
     if balance is not None and candidate.effect == LOAD and decided_by_balance(point.vehicle, candidate):
         return _load_by_the_day(candidate, point, balance)
     if balance is None or CATALOGUE[candidate.effect].imbalance != "rotor" or not steadily(candidate):
@@ -209,10 +194,10 @@ def _by_the_day(candidate: Candidate, point: Point, balance: Balance | None) -> 
     sd = rotor_loss(balance, int(dict(candidate.fixed)["rotor"]))[1]
     reach = sd * float(stats.t.ppf(0.975, balance.freedom))
     value = Value(scale, candidate.parameter("scale").unit, sd, (max(scale - reach, 0.0), scale + reach))
-    return {"scale": value}, 2.0 * float(stats.t.sf((1.0 - scale) / sd, balance.freedom))
+    return {"scale": value}
 
 
-def _load_by_the_day(candidate: Candidate, point: Point, balance: Balance) -> tuple[dict[str, Value], float]:
+def _load_by_the_day(candidate: Candidate, point: Point, balance: Balance) -> dict[str, Value]:
     """A load's mass and place, with the errors of thrust and trim from day to day; its height is unknown."""
     values, whole = candidate.values(point), point.vehicle.mass + float(candidate.values(point)["mass"])
     share = float(values["mass"]) / whole
@@ -235,7 +220,7 @@ def _load_by_the_day(candidate: Candidate, point: Point, balance: Balance) -> tu
         found[name] = Value(
             value, candidate.parameter(name).unit, sd, (max(value - reach, low), min(value + reach, high))
         )
-    return found, 2.0 * float(stats.t.sf(float(values["mass"]) / sds["mass"], balance.freedom))
+    return found
 
 
 def _steady_rivals(

@@ -18,6 +18,7 @@ from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.naming.answer import numbers_of
 from crazyem.diagnosis.naming.balance import Balance, by_balance
 from crazyem.diagnosis.naming.named import Named, Value
+from crazyem.diagnosis.naming.presence import improbable
 from crazyem.diagnosis.naming.prune import left_out
 from crazyem.diagnosis.naming.steady import with_exact_torques
 from crazyem.diagnosis.naming.trials import Selection
@@ -69,13 +70,6 @@ def not_determined(candidate: Candidate, parameters: Mapping[str, Value], point:
     return ""
 
 
-def improbable(chance: float) -> str:
-    """Reason why an effect of this probability is no finding; "" if it is one."""
-    if chance >= CONFIDENCE.min_probability:
-        return ""
-    return f"not determined: the flights make it probable with {chance:.2g} only"
-
-
 def at_bound(value: float, ends: tuple[float, float], neutral: float) -> bool:
     """Whether a number is at an end of its range; neutral is no end."""
     near = CONFIDENCE.at_bound * max(abs(e) for e in ends)
@@ -122,12 +116,7 @@ def without_undetermined(
         else:
             say(f"  left out again, {reason}: {candidate.label}")
             gone[candidate.effect] = reason
-            fitted, accepted, steps = left_out(
-                data, selection.fitted, list(selection.accepted), list(selection.steps), candidate
-            )
-            selection = replace(
-                selection, final=fitted.point, fitted=fitted, accepted=tuple(accepted), steps=tuple(steps)
-            )
+            selection = left_out(data, selection, candidate)
         selection, balance = by_balance(data, with_exact_torques(data, selection))
 
 

@@ -66,7 +66,7 @@ def _substitute_trial(data: Data, held_out: Data | None, selection: Selection, i
 
 def _comparison_trial(candidate: Candidate, value: float, blocks: NDArray, parameter_cost: float) -> Trial:
     """A trial of effects in the place of another effect, used for the comparison with it alone."""
-    return Trial(candidate, 0.0, 0.0, 1.0, 0.0, 0.0, blocks=blocks, value=value, parameter_cost=parameter_cost)
+    return Trial(candidate, 0.0, 0.0, 1.0, 0.0, blocks=blocks, value=value, parameter_cost=parameter_cost)
 
 
 def rotors_against_load(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
@@ -106,8 +106,8 @@ def refitted(
         return value, blocks, accepted_covariance(fitted, candidates)
     apart = held_out.twin()
     there = held_out_fit(apart, fitted.point, candidates)
-    more, beyond, known = joint_gain(fitted, apart, there, candidates)
-    return value + there.loglik + more, np.append(blocks, beyond), known
+    joint = joint_gain(fitted, apart, there, candidates)
+    return value + there.loglik + joint.gain, np.append(blocks, joint.blocks), joint.covariance
 
 
 def occam_cost_of(one: Candidate, candidates: Sequence[Candidate], known: NDArray) -> float:

@@ -29,7 +29,6 @@ class Named:
         name: in the catalogue; `label` with its choices.
         parameters: the fitted ones; `chosen`: the searched ones.
         held_out_nats: gain of log-likelihood on held-out flights.
-        p_value: of its score test, corrected for the number of candidates.
         confidence: probability that this effect is real, and not one of its look-alikes.
         fitted_as: the effect as which it was fitted; "": by its own name.
         log_odds: log posterior odds of the effect, look-alikes aside; None: not known.
@@ -40,7 +39,6 @@ class Named:
     parameters: dict[str, Value]
     chosen: dict[str, object]
     held_out_nats: float
-    p_value: float
     confidence: float
     fitted_as: str = ""
     log_odds: float | None = None

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 from scipy.special import logit
 
 from crazyem.diagnosis.fitting.fit import Data
@@ -59,24 +58,20 @@ def other_likelihoods(
                 # the gain of the regression says nothing of gusts: their own gain counts
                 left = replace(remains.without_force(), gained=gusts.gain)
                 sure = confidence_factor(left, held) * presence(gusts.gain, held, gusts.gain)
-                chance = float(np.exp(-min(held, 700.0)))
-                found.append(Named(GUSTS.name, GUSTS.name, values, {}, held, chance, sure, log_odds=float(logit(sure))))
+                found.append(Named(GUSTS.name, GUSTS.name, values, {}, held, sure, log_odds=float(logit(sure))))
     if not wanted or accelerometer.EFFECT in wanted:
-        tilted = accelerometer.tilt(data, point)
-        if tilted is not None:
-            solution, gram = tilted
+        solution = accelerometer.tilt(data, point)
+        if solution is not None:
             sd = np.sqrt(np.diag(solution.covariance)[:3])
             angles = solution.theta[:3]
-            wald = float(stats.f.sf(np.sum((angles / sd)[:2] ** 2) / 2, 2, max(len(gram.score) - 7, 3)))
             held = accelerometer.held_out_gain(apart or data, point, angles, yaw_sd=float(sd[2]))
-            enough = max(solution.p_value, wald) < SELECTION.p_value and held > SELECTION.min_evidence
-            if enough and np.abs(angles[:2]).max() > ACCELEROMETER.min_angle:
+            if held > SELECTION.min_evidence and np.abs(angles[:2]).max() > ACCELEROMETER.min_angle:
                 values = {n: Value(float(a), "rad", float(e), interval_95(float(a), float(e)))
                           for n, a, e in zip(accelerometer.ANGLES, angles, sd, strict=True)}  # fmt: skip
                 dispersion = max(1.0, solution.dispersion)
                 sure = presence(solution.gain / dispersion, held, solution.gain, dispersion=dispersion)
                 name = accelerometer.EFFECT
-                found.append(Named(name, name, values, {}, held, wald, sure, log_odds=float(logit(sure))))
+                found.append(Named(name, name, values, {}, held, sure, log_odds=float(logit(sure))))
     return found
 
 
@@ -104,9 +99,8 @@ def late_rotors(
     for name, (value, sd) in late.values.items():
         p = CATALOGUE[name].parameters[0]
         values = {p.name: Value(value, p.unit, sd, interval_95(value, sd))}
-        p_value = float(np.exp(-min(late.nats, 700.0)))
         there = presence_by_odds(min(late.held_out, late.nats))
         sure = there * (0.5 if late.alike else 1.0)
         sure = min(sure, CONFIDENCE.doubtful) if unresponsive else sure
-        named.append(Named(name, name, values, {}, late.held_out, p_value, sure, log_odds=float(logit(there))))
+        named.append(Named(name, name, values, {}, late.held_out, sure, log_odds=float(logit(there))))
     return named, ((MOTOR_LAG.name, INPUT_DELAY.name),) if late.alike else ()

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy import stats
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, with_torque_memory_refit
@@ -17,7 +18,7 @@ from crazyem.diagnosis.fitting.nuisances import refine_base, solved, without
 from crazyem.diagnosis.locating.locate import AXES, Finding
 from crazyem.diagnosis.locating.place import left_by_place, slope_finding
 from crazyem.diagnosis.naming.trials import Selection, scatter
-from crazyem.diagnosis.settings import LOCATION, SELECTION
+from crazyem.diagnosis.settings import CONFIDENCE, LOCATION
 from crazyem.physics.effects.external_force import FORCE_BY_PLACE
 
 FORCE = Candidate(FORCE_BY_PLACE.name, (), tuple(p.name for p in FORCE_BY_PLACE.parameters))
@@ -59,7 +60,8 @@ def by_place(
         (named, flights), (instead, again) = data.workers.map(lambda run: both(*run), runs)
         theirs, ours = flights.block_loglik(named.point), again.block_loglik(instead.point)
         better = instead.loglik - named.loglik - len(FORCE.free) + sum(len(c.free) for c in names)
-        if better < LOCATION.min_structure or better < SELECTION.separation * scatter(ours - theirs):
+        chance = float(stats.norm.sf(better / scatter(ours - theirs)))
+        if better < LOCATION.min_structure or chance > CONFIDENCE.min_look_alike:
             return selection, None
         finding = _finding(again, instead, better)
         if finding is None:

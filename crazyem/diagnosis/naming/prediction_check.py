@@ -50,10 +50,7 @@ def without_worse_predictions(
         rest = [[a for a in selection.accepted if a is not c] for c in selection.accepted]
         misled = selection.accepted[int(np.argmin(data.workers.map(worse, rest)))]
         say(f"  left out again, flights are predicted worse with it: {misled.label}")
-        fitted, accepted, steps = left_out(
-            data, selection.fitted, list(selection.accepted), list(selection.steps), misled
-        )
-        selection = replace(selection, final=fitted.point, fitted=fitted, accepted=tuple(accepted), steps=tuple(steps))
+        selection = left_out(data, selection, misled)
     return selection
 
 

@@ -1,4 +1,4 @@
-"""Backward elimination: effects that the final model does not need, or that noise of another kind explains as well."""
+"""Backward elimination: effects that are improbable beside the others are left out again."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -8,8 +8,6 @@ import numpy as np
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted
-from crazyem.diagnosis.fitting.gram import used
-from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import (
     can_be_finding,
     held_out_fit,
@@ -18,92 +16,73 @@ from crazyem.diagnosis.fitting.nuisances import (
     refine_base,
     without,
 )
-from crazyem.diagnosis.locating.random_torques import off_peak_gram, peaks
 from crazyem.diagnosis.naming.detection_limits import is_implausible
-from crazyem.diagnosis.naming.trials import Selection, Step, dispersion_of, p_value_of_both, significance, wald
-from crazyem.diagnosis.settings import FITTING, SELECTION
+from crazyem.diagnosis.naming.evidence import expected_gain
+from crazyem.diagnosis.naming.presence import improbable
+from crazyem.diagnosis.naming.trials import Selection, Trial, dispersion_of
 
 
-def pruned(
-    data: Data, nominal: Point, selection: Selection, held_out: Data | None, say: Callable[[str], None]
-) -> Selection:
-    """The selection without effects that are not needed, and with the doubted ones marked.
-
-    `nominal` is the model before any nuisance is fitted.
-    """
-    fitted, accepted, steps = selection.fitted, list(selection.accepted), list(selection.steps)
-    held_out = held_out and held_out_twin(held_out, fitted.point, accepted)
-    fitted, accepted, steps = backward_elimination(data, fitted, accepted, steps, held_out, say)
-    doubtful: frozenset[str] = frozenset()
-    if TRIM not in selection.final.vehicle.effects:  # both judge by the scatter of blocks (see `by_gain`)
-        fitted, accepted, steps = without_noise_look_alikes(data, fitted, accepted, steps, held_out, say)
-        doubtful = vibration_look_alikes(data, nominal, fitted, accepted, say)
-    return replace(
-        selection, final=fitted.point, steps=tuple(steps), accepted=tuple(accepted), fitted=fitted, doubtful=doubtful
-    )
-
-
-def backward_elimination(
-    data: Data,
-    fitted: Fitted,
-    accepted: list[Candidate],
-    steps: list[Step],
-    held_out: Data | None,
-    say: Callable[[str], None],
-) -> tuple[Fitted, list[Candidate], list[Step]]:
-    """Leave out the effects that the fitted or the held-out flights do not need, the weakest first.
+def pruned(data: Data, selection: Selection, held_out: Data | None, say: Callable[[str], None]) -> Selection:
+    """The selection without improbable effects, the most improbable left out first, whatever the order of finding.
 
     An effect stays if another would leave its physical range without it: a thrust curve without a thrust scale goes to
-    the slope at which the thrust does not depend on the command.
+    the slope at which the thrust does not depend on the command. One that the balance of the flights decided stays, and
+    so does a trim, which every real drone has.
     """
-    accepted, steps = list(accepted), list(steps)
-    kept = [s.taken.candidate for s in steps if s.taken and s.taken.log_odds is not None]  # the balance decides
-    while accepted:
-        here = data.loglik(fitted.point, passes=2)
-        held_here = held_out_fit(held_out, fitted.point, accepted).loglik if held_out else 0.0
-        judged = []
-        bare = data.workers.map(partial(fit_without, data, held_out, fitted, accepted), accepted)
-        for k, (c, (less, held_less)) in enumerate(zip(accepted, bare, strict=True)):
-            step = next(s for s in steps if s.taken and s.taken.candidate.effect == c.effect)
-            assert step.taken is not None
-            dispersion = dispersion_of(fitted, len(c.free), offset=sum(len(a.free) for a in accepted[:k]))
-            gain, held = (here - less.loglik) / dispersion, (held_here - held_less) / dispersion
-            need = -max(SELECTION.min_evidence, SELECTION.cost_share * gain)
-            # held-out flights that should bring little of the gain cannot show the effect
-            least = max(SELECTION.informative, SELECTION.cost_share * gain) * dispersion
-            should = np.inf if held_out is None else expected(held_out, fitted, accepted, c)
-            if should > least:
-                need = SELECTION.min_held_out
-            brings = gain - len(c.free) + held
-            held_up = held + SELECTION.min_evidence - need if held_out else np.inf
-            # an effect that no flight needs goes first: it may be why another fails on held-out flight
-            judged.append(((brings > SELECTION.min_evidence, min(brings, held_up)), c, less))
-            now = replace(
-                step.taken, gain=gain * dispersion, held_out=held * dispersion, expected=should, dispersion=dispersion
-            )
-            steps = [replace(s, taken=now) if s is step and held_out else s for s in steps]
-        worst = min((j for j in judged if j[1] not in kept), key=lambda j: j[0], default=None)
-        if worst is None or worst[0][1] > SELECTION.min_evidence:
+    held_out = held_out and held_out_twin(held_out, selection.final, selection.accepted)
+    while selection.accepted:
+        selection, bare = judged_again(data, held_out, selection)
+        taken = [s.taken for s in selection.steps if s.taken]
+        doubtful = [
+            (trial.presence(1), trial.presence(order), candidate, less)
+            for trial, order, candidate, less in zip(taken, selection.orders(), selection.accepted, bare, strict=True)
+            if trial.log_odds is None and candidate.effect != TRIM
+        ]
+        for _, chance, candidate, less in sorted(doubtful, key=lambda entry: entry[0]):
+            reason = improbable(chance)
+            fitted = _fit_of_others(data, selection, less, candidate) if reason else None
+            if fitted is not None:
+                say(f"  left out again, improbable beside the others: {candidate.label}")
+                left_out = {**selection.left_out, candidate.effect: reason}
+                selection = replace(_without(selection, fitted, candidate), left_out=left_out)
+                break
+        else:
             break
-        rest = [c for c in accepted if c is not worst[1]]
-        bare_of_it = refine_base(data, worst[2].point, rest)
-        if any(is_implausible(bare_of_it.point, c) and not is_implausible(fitted.point, c) for c in rest):
-            say(f"  stays, because another would go on to the end of its range: {worst[1].label}")
-            kept.append(worst[1])
-            data.settle(fitted.point)
-            continue
-        say(f"  left out again: {worst[1].label}")
-        accepted, fitted = rest, bare_of_it
-        steps = [s for s in steps if s.taken is None or s.taken.candidate.effect != worst[1].effect]
-    return fitted, accepted, steps
+    return selection
 
 
-def expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate) -> float:
-    """Mean gain of a real effect of this size on held-out flights [nats]: z'Az/2, all else profiled out.
+def _fit_of_others(data: Data, selection: Selection, less: Fitted, candidate: Candidate) -> Fitted | None:
+    """The fit without an effect, from the fit `less`; None if another effect would leave its physical range."""
+    rest = [c for c in selection.accepted if c is not candidate]
+    fitted = refine_base(data, less.point, rest)
+    if any(is_implausible(fitted.point, c) and not is_implausible(selection.final, c) for c in rest):
+        data.settle(selection.final)
+        return None
+    return fitted
 
-    A hover says nothing of a damping, real or not. The bounds of nuisances are left out, so the value is rather too
-    small: an order of magnitude.
-    """
+
+def judged_again(data: Data, held_out: Data | None, selection: Selection) -> tuple[Selection, list[Fitted]]:
+    """The selection with the gain of each effect beside all the others, and the fits without each."""
+    fitted, accepted = selection.fitted, selection.accepted
+    here = data.loglik(fitted.point, passes=2)
+    there = held_out_fit(held_out, fitted.point, accepted).loglik if held_out else 0.0
+    bare = data.workers.map(partial(_fit_without, data, held_out, fitted, accepted), accepted)
+    again: dict[str, Trial] = {}
+    for k, (c, (less, held_less)) in enumerate(zip(accepted, bare, strict=True)):
+        trial = next(s.taken for s in selection.steps if s.taken and s.taken.candidate.effect == c.effect)
+        dispersion = dispersion_of(fitted, len(c.free), offset=sum(len(a.free) for a in accepted[:k]))
+        again[c.effect] = replace(trial, gain=here - less.loglik, dispersion=dispersion)
+        if held_out:
+            mean = _expected(held_out, fitted, accepted, c)
+            again[c.effect] = replace(again[c.effect], held_out=there - held_less, expected=mean)
+    steps = tuple(replace(s, taken=again[s.taken.candidate.effect]) if s.taken else s for s in selection.steps)
+    return replace(selection, steps=steps), [less for less, _ in bare]
+
+
+def _expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate) -> float:
+    """Mean gain of a real effect of this size on held-out flights [nats] (`evidence.expected_gain`)."""
+    if can_be_finding(candidate):
+        held_out = held_out.constraining(candidate.effect)
     point = fitted.point if held_out.own is None else replace(fitted.point, noise=held_out.own.noise)
     rest = [c for c in accepted if c is not candidate]
     free = nuisances(held_out, point, accepted)
@@ -112,18 +91,14 @@ def expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], cand
     _, information = held_out.gram(point, columns).total(range(len(columns)))
     own = len(candidate.free)
     weight = np.array([0.0] * sum(len(c.free) for c in [candidate, *rest]) + [w for _, p in free for w in p])
-    a = information + np.diag(weight)
-    inner = a[:own, :own] - a[:own, own:] @ np.linalg.lstsq(a[own:, own:], a[own:, :own], rcond=1e-12)[0]
     here, neutral = candidate.values(point), candidate.neutral(point)
     away = np.array([here[n] - neutral[n] for n in candidate.free])
-    # an effect that is a nuisance, too, gains part of this without being a finding
     usual = {n: w for c, p in nuisances(held_out, point, ()) if c.effect == candidate.effect for n, w in zip(c.free, p)}
-    spread = np.diag([usual[n] ** -0.5 if n in usual else 0.0 for n in candidate.free])
-    inner = inner @ np.linalg.inv(np.eye(own) + spread @ spread @ inner)
-    return 0.5 * float(away @ inner @ away)
+    spread = np.array([usual[n] ** -0.5 if n in usual else 0.0 for n in candidate.free])
+    return expected_gain(information + np.diag(weight), slice(0, own), away, spread)
 
 
-def fit_without(
+def _fit_without(
     data: Data, held_out: Data | None, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate
 ) -> tuple[Fitted, float]:
     """The fit without one of the effects, and its log-likelihood on held-out flights; the data stay as they are."""
@@ -135,93 +110,17 @@ def fit_without(
     return less, held_out_fit(there, less.point, rest).loglik if there else 0.0
 
 
-def without_noise_look_alikes(
-    data: Data,
-    fitted: Fitted,
-    accepted: list[Candidate],
-    steps: list[Step],
-    held_out: Data | None,
-    say: Callable[[str], None],
-) -> tuple[Fitted, list[Candidate], list[Step]]:
-    """Leave out effects that are not significant beside disturbances with memory.
-
-    Noise with memory looks like a wrong inertia, and gusts look like a wrong thrust curve. The test is on a copy of the
-    data, so that the fit does not start from the model with disturbances.
-    """
-    while accepted:
-        apart = data.twin()
-        noise = replace(
-            fitted.point.noise,
-            disturbance=np.concatenate([np.full(3, FITTING.start_force), np.full(3, FITTING.start_torque)]),
-            memory=1.0,
-        )
-        point = apart.fit_noise(replace(fitted.point, noise=noise))
-        if apart.loglik(point, passes=2) < data.loglik(fitted.point, passes=2) + SELECTION.memory_gain:
-            break
-        with_memory = refine_base(apart, point, accepted, rounds=2, noise=False)
-        sure, offset = [], 0
-        for c in accepted:
-            p_value = significance(with_memory, len(c.free), offset=offset)
-            if held_out and SELECTION.p_value <= p_value < SELECTION.held_out_p_value:
-                taken = next(s.taken for s in steps if s.taken and s.taken.candidate.effect == c.effect)
-                p_value = p_value_of_both(
-                    p_value, held_gain(data, held_out, with_memory, accepted, c) / taken.dispersion
-                )
-            sure.append(p_value)
-            offset += len(c.free)
-        worst = int(np.argmax(sure))
-        if sure[worst] < SELECTION.p_value:
-            break
-        say(f"  left out again, disturbances with memory explain it: {accepted[worst].label}")
-        fitted, accepted, steps = left_out(data, fitted, accepted, steps, accepted[worst])
-    return fitted, accepted, steps
+def left_out(data: Data, selection: Selection, candidate: Candidate) -> Selection:
+    """The selection without one of its effects, fitted again."""
+    rest = [a for a in selection.accepted if a is not candidate]
+    return _without(selection, refine_base(data, without(selection.final, candidate.effect), rest), candidate)
 
 
-def held_gain(data: Data, held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate) -> float:
-    """Gain of a fitted effect on held-out flights [nats]."""
-    there = held_out_fit(held_out, fitted.point, accepted).loglik
-    return there - fit_without(data, held_out, fitted, accepted, candidate)[1]
-
-
-def vibration_look_alikes(
-    data: Data, nominal: Point, fitted: Fitted, accepted: Sequence[Candidate], say: Callable[[str], None]
-) -> frozenset[str]:
-    """Effects that have another size without the peaks of the spectrum than with them: a vibration explains them.
-
-    The control loop answers a vibration, so gains, delays and inertias seem wrong at its frequency. A delay whose loop
-    oscillates makes a peak, too. But the peak is gone in the model with the delay, or the delay has the same size
-    without the peak.
-    """
-    found = [peaks(m, nominal) for m in data.models]  # before nuisances have fitted the peaks
-    if not accepted or not any(found) or not any(peaks(m, fitted.point) for m in data.models):
-        return frozenset()
-    free = [*accepted, *(c for c, _ in nuisances(data, fitted.point, accepted))]
-    columns = [x for c in free for x in c.columns(fitted.point)]
-    here = np.array([c.values(fitted.point)[n] - c.neutral(fitted.point)[n] for c in free for n in c.free])
-    away = np.where(fitted.precision > 0, here, 0.0)
-    whole, beside = (
-        (g, g.solve(range(g.size), precision=fitted.precision, prior=-away, effective=True))
-        for g in (data.gram(fitted.point, columns), off_peak_gram(data, fitted.point, columns, found))
+def _without(selection: Selection, fitted: Fitted, candidate: Candidate) -> Selection:
+    """The selection without one of its effects, and with the fit of the others."""
+    rest = tuple(a for a in selection.accepted if a is not candidate)
+    steps = tuple(
+        replace(s, taken=None, alike=()) if s.taken and s.taken.candidate.effect == candidate.effect else s
+        for s in selection.steps
     )
-    information = beside[0].total(range(beside[0].size))[1]
-    taken = used(information, information + np.diag(fitted.precision))  # priors use no degrees of freedom
-    doubtful, offset = [], 0
-    for c in accepted:
-        at = slice(offset, offset + len(c.free))
-        offset = at.stop
-        covariance = beside[1].covariance[at, at]
-        size, apart = here[at] + whole[1].theta[at], beside[1].theta[at] - whole[1].theta[at]
-        share = float(apart @ np.linalg.pinv(covariance) @ apart) / float(size @ np.linalg.pinv(covariance) @ size)
-        if share > SELECTION.size_difference**2 and wald(apart, covariance, beside[0], taken) < SELECTION.hausman_p:
-            say(f"  it has another size without the vibration: {c.label}")
-            doubtful.append(c.effect)
-    return frozenset(doubtful)
-
-
-def left_out(
-    data: Data, fitted: Fitted, accepted: list[Candidate], steps: list[Step], candidate: Candidate
-) -> tuple[Fitted, list[Candidate], list[Step]]:
-    """Without one of the effects, fitted again."""
-    rest = [a for a in accepted if a is not candidate]
-    kept = [s for s in steps if s.taken is None or s.taken.candidate.effect != candidate.effect]
-    return refine_base(data, without(fitted.point, candidate.effect), rest), rest, kept
+    return replace(selection, final=fitted.point, steps=steps, accepted=rest, fitted=fitted)

@@ -5,7 +5,9 @@ time h, a first-order lag of the thrust f answers to the commands u by
 
     f(t + d + h) = k f(t + d) + (1 - k) g(u(t)) + e,    k = exp(-h / lag),
 
-with a parabola g for each rotor, constant within a flight. A high-pass removes slow changes, which the battery causes.
+with a parabola g for each rotor, constant within a flight. Between their samples commands are a spline. u is the
+command times the voltage, and the voltage drops at once under the load of all rotors. A file without a voltage says
+nothing of the lag: a firmware that compensates the drop looks like quick rotors. A high-pass removes slow changes.
 
 All terms have errors: speeds have noise, commands are sampled, and air disturbs the rotors, to which the loop answers.
 Each error biases least squares, noise of 1 % by a sixth. The errors of a sample do not affect earlier samples, so
@@ -26,10 +28,11 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 from scipy.optimize import least_squares
 from scipy.signal import butter, sosfiltfilt
+from scipy.special import expit
 
 from crazyem.diagnosis.flights.inputs import samples
 from crazyem.diagnosis.locating.locate import Finding
-from crazyem.diagnosis.settings import RECORDINGS, ROTOR_RESPONSE, SELECTION
+from crazyem.diagnosis.settings import CONFIDENCE, RECORDINGS, ROTOR_RESPONSE, SELECTION
 from crazyem.physics.effects.timing import INPUT_DELAY, MOTOR_LAG
 from crazyem.physics.rotors import thrust_from_speed
 from crazyem.recordings.airborne import airtime
@@ -55,31 +58,34 @@ class Response:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Result of one recording: best (2,) lag and delay [s], their covariance by scatter, left (4, n) N, the thrust that
-    was commanded and not produced by each rotor, span of time [s], held: s from command to command."""
+    """Result of one recording.
+
+    Attributes:
+        best: (2,) lag and delay [s].
+        covariance: by scatter; None: without a voltage, or with weak instruments, lag and delay are not known.
+        left: (4, n) N, the thrust that was commanded and not produced by each rotor.
+        span: of time [s].
+    """
 
     best: NDArray
-    covariance: NDArray
+    covariance: NDArray | None
     left: NDArray
     span: tuple[float, float]
-    held: float = 0.0
 
 
 def answers(recordings: Sequence[Recording], vehicle: Vehicle) -> list[Answer]:
-    """Results of the recordings in which commands and speeds determine lag and delay."""
+    """Results of the recordings with commands and speeds."""
     return [a for a in (_of_one(recording, vehicle) for recording in recordings) if a is not None]
 
 
 def response(found: Sequence[Answer]) -> Response | None:
     """Lag and delay by all recordings together; None if no recording determines them."""
-    if not found:
+    known = [(r.best, np.linalg.inv(r.covariance)) for r in found if r.covariance is not None]
+    if not known:
         return None
-    information = sum(np.linalg.inv(r.covariance) for r in found)
-    covariance = np.linalg.inv(information)
-    lag, delay = covariance @ sum(np.linalg.solve(r.covariance, r.best) for r in found)
-    held = float(np.mean([r.held for r in found]))
-    delay += held / 4.0  # held commands are half a sample late where true ones are smooth, and on time at steps
-    sd = np.array([ROTOR_RESPONSE.lag_sd * lag, np.hypot(ROTOR_RESPONSE.delay_sd, held / np.sqrt(48.0))])
+    covariance = np.linalg.inv(sum(information for _, information in known))
+    lag, delay = covariance @ sum(information @ best for best, information in known)
+    sd = np.array([ROTOR_RESPONSE.lag_sd * lag, ROTOR_RESPONSE.delay_sd])
     usual = np.outer(sd, sd) * np.array([[1.0, ROTOR_RESPONSE.correlation], [ROTOR_RESPONSE.correlation, 1.0]])
     return Response(float(lag), float(delay), covariance + usual)
 
@@ -103,7 +109,7 @@ def unresponsive_rotor(found: Sequence[Answer]) -> Finding | None:
 
 
 def _of_one(recording: Recording, vehicle: Vehicle) -> Answer | None:
-    """Result of one recording; None if it does not determine lag and delay."""
+    """Result of one recording; None if commands or speeds are missing or too slow."""
     air = airtime(recording)
     if vehicle.rotor_constant is None or not air.flown:
         return None
@@ -123,13 +129,12 @@ def _of_one(recording: Recording, vehicle: Vehicle) -> Answer | None:
     if inside.sum() < ROTOR_RESPONSE.min_samples:
         return None
     at, wanted = time[inside], command[inside].astype(float)
-    volts, known = samples(recording, "voltage")
-    if volts.size > 1:  # a rotor answers to duty times voltage, and the voltage drops under load
-        wanted = wanted * np.interp(at, volts, known[:, 0])[:, None]
     step = float(np.median(np.diff(at)))
     if step > ROTOR_RESPONSE.max_period or not np.all(np.std(wanted, axis=0) > 0):
         return None
     thrust = CubicSpline(when, thrust_from_speed(speed, rotor_constant=vehicle.rotor_constant))
+    volts, measured = samples(recording, "voltage")
+    wanted = wanted * _voltage(volts, measured[:, 0], at, thrust)[:, None] if volts.size > 1 else wanted
     equation = _LagEquation.of(at, wanted, thrust, step)
     min_delay = -ROTOR_RESPONSE.spline_reach * step  # below, instruments share errors with e
     bounds = (
@@ -141,13 +146,32 @@ def _of_one(recording: Recording, vehicle: Vehicle) -> Answer | None:
         for s in ROTOR_RESPONSE.start_lags
     ]
     best = min(tries, key=lambda t: float(t.cost))
-    if np.linalg.matrix_rank(best.jac) < 2 or equation.strength(best.x) < ROTOR_RESPONSE.min_f:
-        return None
     plain, _ = equation.errors(best.x)
-    free = best.fun.size - best.x.size - 4 * equation.shapes.shape[2]
+    free = best.fun.size - best.x.size - 4 * equation.shapes.shape[3]
     variance = max(float(np.mean(plain**2)), 2.0 * best.cost / free)  # the second is larger if errors have a memory
-    covariance = variance * np.linalg.inv(best.jac.T @ best.jac)
-    return Answer(best.x, covariance, _command_residuals(at, wanted, thrust, step), (float(at[0]), float(at[-1])), step)
+    known = volts.size > 1 and np.linalg.matrix_rank(best.jac) == 2 and equation.strength(best.x) > ROTOR_RESPONSE.min_f
+    covariance = variance * np.linalg.inv(best.jac.T @ best.jac) if known else None
+    return Answer(best.x, covariance, _command_residuals(at, wanted, thrust, step), (float(at[0]), float(at[-1])))
+
+
+def _voltage(when: NDArray, volts: NDArray, at: NDArray, thrust: CubicSpline) -> NDArray:
+    """Voltage (n,) [V] at times (n,) s, from samples (k,) at times (k,) s: a slow trend, and a drop under the load.
+
+    A battery is measured at 10 Hz or less, but its voltage follows the current at once. The current goes with the power
+    of all rotors.
+    """
+    new = np.flatnonzero(np.diff(volts) != 0.0) + 1
+    new = new[(when[new] > at[0]) & (when[new] < at[-1])]
+
+    def regressors(times: NDArray) -> NDArray:
+        load = np.maximum(thrust(times), 0.0) ** 1.5
+        trend = np.polynomial.legendre.legvander(2.0 * (times - at[0]) / (at[-1] - at[0]) - 1.0, 3)
+        return np.column_stack([trend, load.mean(axis=1)])
+
+    if new.size < ROTOR_RESPONSE.min_voltages:
+        return np.interp(at, when, volts)
+    fit = np.linalg.lstsq(regressors(when[new]), volts[new], rcond=None)[0]
+    return regressors(at) @ fit
 
 
 def _command_residuals(at: NDArray, wanted: NDArray, thrust: CubicSpline, step: float) -> NDArray:
@@ -168,7 +192,8 @@ class _LagEquation:
 
     Attributes:
         grid: (n,) s, every `step`. thrust: at any time (m,) [s] -> (m, 4) N. mean: (4,) N.
-        shapes: (n, 4, 2) command and its square. row: (m,) start rows of the equation, which ends `steps` rows later.
+        shapes: (parts, n, 4, 2) command and its square at the start of each part of a step. row: (m,) start rows of
+            the equation, which ends `steps` rows later.
         instruments: (4, m, p) orthonormal.
     """
 
@@ -183,29 +208,31 @@ class _LagEquation:
 
     @classmethod
     def of(cls, at: NDArray, wanted: NDArray, thrust: CubicSpline, step: float) -> "_LagEquation":
-        """The equation of commands (k, 4) at times (k,) s, each held until the next, and of thrusts."""
+        """The equation of commands (k, 4) at times (k,) s and of thrusts."""
         grid = np.arange(at[0], at[-1], step)
-        held = wanted[np.searchsorted(at, grid + 1e-3 * step, "right") - 1]
-        relative = held / wanted.mean(axis=0)
-        shapes = _high_pass(np.stack([relative, relative**2], 2), step)
+        parts = max(1, round(step / ROTOR_RESPONSE.command_period))
+        command = CubicSpline(at, wanted / wanted.mean(axis=0))
+        fine = [command(grid + i / parts * step) for i in range(parts)]
+        shapes = np.stack([_high_pass(np.stack([u, u**2], 2), step) for u in fine])
         mean = thrust(grid).mean(axis=0)
         steps = max(1, round(ROTOR_RESPONSE.spacing / step))
         edge = round(RECORDINGS.edge / step)  # transients of the high-pass
         row = np.arange(edge + ROTOR_RESPONSE.instruments, grid.size - edge - steps)
         changes = _high_pass(thrust(grid) / mean, step)
         before = np.roll(changes, ROTOR_RESPONSE.spline_reach, axis=0)  # samples without influence on f(t + d)
-        earlier = np.concatenate([shapes[:, :, 0], before], axis=1)
+        earlier = np.concatenate([_high_pass(command(grid), step), before], axis=1)
         past = np.stack([earlier[row - j] for j in range(1, ROTOR_RESPONSE.instruments + 1)], 2)  # (m, 8, j)
         instruments = [np.linalg.qr(past[:, (r, r + 4)].reshape(row.size, -1))[0] for r in range(4)]
         return cls(grid, step, steps, thrust, mean, shapes, row, np.stack(instruments))
 
     def errors(self, x: NDArray) -> tuple[NDArray, NDArray]:
         """(4, m) errors e for a lag and a delay [s], and (4, p) their projections on the instruments."""
-        keep = np.exp(-self.step / x[0])
+        keep, parts = np.exp(-self.step / x[0]), len(self.shapes)
+        part = np.exp(-self.step / parts / x[0])
         now = _high_pass(self.thrust(self.grid + x[1]) / self.mean, self.step)
         change = now[self.row + self.steps] - keep**self.steps * now[self.row]
-        share = [(1.0 - keep) * keep ** (self.steps - 1 - j) for j in range(self.steps)]
-        regressors = sum(w * self.shapes[self.row + j] for j, w in enumerate(share))
+        of_step = sum((1.0 - part) * part ** (parts - 1 - i) * self.shapes[i] for i in range(parts))
+        regressors = sum(keep ** (self.steps - 1 - j) * of_step[self.row + j] for j in range(self.steps))
         plain, projected = [], []
         for rotor, q in enumerate(self.instruments):
             target, projection = q.T @ change[:, rotor], q.T @ regressors[:, rotor]
@@ -284,7 +311,6 @@ def late_response(found: Response, apart: Response | None, vehicle: Vehicle) -> 
     if apart is not None and -apart.nats(*at) > SELECTION.min_evidence:
         return None
     held = nats if apart is None else apart.nats(*at) - apart.nats(*file)
-    alike = (
-        len(values) == 1 and delay > file[1] and abs(alone[LAG][2] - alone[DELAY][2]) < SELECTION.look_alike_difference
-    )
+    surer = float(expit(abs(alone[LAG][2] - alone[DELAY][2])))
+    alike = len(values) == 1 and delay > file[1] and surer < 1.0 - CONFIDENCE.min_look_alike
     return Late(values, nats, held, alike) if held > SELECTION.min_evidence / 2 else None

@@ -2,7 +2,8 @@
 
 Each turn adds one effect. One pass of the filter gives the score and the information of all candidates (`gram`). The
 candidates with the largest linear gains are fitted in full. Their evidence is the gain over the dispersion, on fitted
-and held-out flights, less the number of parameters. The best one joins the model; look-alikes are kept beside it.
+and held-out flights, less the number of parameters. The best one joins the model; look-alikes are kept
+beside it. In the end, effects that are improbable beside the others are left out again (`prune`).
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +23,6 @@ from crazyem.diagnosis.fitting.nuisances import (
     held_out_twin,
     is_nonphysical,
     nuisances,
-    p_value_by_gain,
     refine_base,
     refine_with_memory,
     with_nuisances,
@@ -33,7 +33,7 @@ from crazyem.diagnosis.naming.evidence import accepted_covariance, joint_gain, o
 from crazyem.diagnosis.naming.onset import date, onset_of
 from crazyem.diagnosis.naming.prune import pruned
 from crazyem.diagnosis.naming.starting_points import best_starting_points
-from crazyem.diagnosis.naming.steady import onset_p_value, steady_rivals, without_trim_rivals
+from crazyem.diagnosis.naming.steady import steady_rivals, without_trim_rivals
 from crazyem.diagnosis.naming.steady_odds import decided_by_balance
 from crazyem.diagnosis.naming.trials import (
     Selection,
@@ -43,11 +43,7 @@ from crazyem.diagnosis.naming.trials import (
     by_evidence,
     dispersion_of,
     distinguishable,
-    is_significant,
-    p_value_of_both,
     separate_evidence,
-    significance,
-    undominated,
 )
 from crazyem.diagnosis.settings import SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -91,16 +87,12 @@ def linear_trials(
         solution = gram.solve(order, precision=w, prior=mid, low=lo, high=hi, tested=range(len(order) - k, len(order)))
         dispersion = max(1.0, gram.solve(order[-k:]).dispersion)
         gain, held = (now - then for now, then in zip((solution.gain, solution.held_out), before or (gain0, held0)))
-        p_value = p_value_by_gain(point, gain / dispersion, k, len(gram.score), solution.p_value)
-        found.append((Trial(c, gain, held, dispersion, p_value, gain / dispersion - k), solution))
+        found.append((Trial(c, gain, held, dispersion, gain / dispersion - k), solution))
 
     for c, mine in zip(tested, index[len(base) :], strict=True):
         later = onset_of(data, point, c, gram, mine)
         if later is not None:
-            found += [
-                (replace(t, p_value=onset_p_value(point, t.p_value, len(gram.score))), s)
-                for t, s in linear_trials(data, point, accepted, [later])
-            ]
+            found += linear_trials(data, point, accepted, [later])
         if decided_by_balance(point.vehicle, c):  # the balance decides on steady effects, not on later onsets
             continue
         lo, hi = (np.array(b) for b in c.bounds(point))
@@ -165,7 +157,7 @@ def fitted_trial(basis: Basis, trial: Trial, solution: Solution, *, say: Callabl
         fit = refine_base(data, at_linear_size(point, trial.candidate, solution), mine, rounds=3, noise=False)
         return compared(basis, trial, data, fit)
     except DivergedError:  # the linear approximation went too far
-        return replace(trial, p_value=1.0)
+        return trial
 
 
 def constrained_basis(basis: Basis, candidate: Candidate) -> Basis:
@@ -206,29 +198,32 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
     gain = fit.loglik - basis.value
     blocks, recording = data.block_loglik(fit.point), data.recordings_of_blocks()
     held, value, mine = trial.held_out, gain, [*basis.accepted, trial.candidate]
+    expected = 0.0  # blocks of the same flight confirm nothing
     if basis.held_out:
         apart = basis.held_out.twin()
         there = held_out_fit(apart, fit.point, mine)
         held = there.loglik - basis.held_value
-        more, beyond, covariance = joint_gain(fit, apart, there, mine)
-        blocks = np.append(blocks, beyond)
+        joint = joint_gain(fit, apart, there, mine)
+        blocks = np.append(blocks, joint.blocks)
         recording = np.append(recording, len(data.models) + apart.recordings_of_blocks())
-        value += held + more
+        value += held + joint.gain
+        covariance, expected = joint.covariance, joint.expected
     else:
         covariance = accepted_covariance(fit, mine)
-    k, offset = len(trial.candidate.free), sum(len(c.free) for c in basis.accepted)
-    parameter_cost = occam_cost([trial.candidate], covariance[-k:, -k:])
-    trial = replace(trial, dispersion=dispersion_of(fit, k, offset=offset))
-    wald_p = significance(fit, k, offset=offset)
-    wald_p = p_value_by_gain(fit.point, gain / trial.dispersion, k, len(fit.gram.score), wald_p)
-    # at a start that derivatives do not lead to, the score test says nothing
-    sure = p_value_of_both(
-        wald_p if trial.candidate.likeliest else max(trial.p_value, wald_p),
-        held / trial.dispersion if basis.held_out else 0.0,
+    k = len(trial.candidate.free)
+    return replace(
+        trial,
+        gain=gain,
+        held_out=held,
+        expected=expected,
+        dispersion=dispersion_of(fit, k, offset=sum(len(c.free) for c in basis.accepted)),
+        admissible=exceeds_limit(fit.point, trial.candidate, data),
+        fitted=fit,
+        blocks=blocks,
+        value=value,
+        recording=recording,
+        parameter_cost=occam_cost([trial.candidate], covariance[-k:, -k:]),
     )
-    sure = sure if exceeds_limit(fit.point, trial.candidate, data) else 1.0
-    judged = replace(trial, gain=gain, held_out=held, p_value=sure, fitted=fit)
-    return replace(judged, blocks=blocks, value=value, recording=recording, parameter_cost=parameter_cost)
 
 
 def compatible(effect: str, found: set[str]) -> bool:
@@ -239,24 +234,17 @@ def compatible(effect: str, found: set[str]) -> bool:
 
 
 def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Callable[[str], None]) -> Step:
-    """One turn of the selection: candidates with large gains are fitted, the best is taken if it is significant."""
+    """One turn of the selection: candidates with large gains are fitted, the best is taken if it is an explanation."""
     counted = basis.held_out is not None
     fitted = basis.data.workers.map(lambda entry: fitted_trial(basis, *entry, say=say), shortlist(linear))
-    trials = by_evidence(fitted, counted=counted)
+    trials = by_evidence([t for t in fitted if t.fitted is not None], counted=counted)
     rest = [t for t, _ in linear if all(t.candidate is not p.candidate for p in trials)]
-    if trim := next((t for t in trials if t.candidate.effect == TRIM and admitted(basis, t)), None):
+    if trim := next((t for t in trials if t.candidate.effect == TRIM and rivals(t, counted=counted)), None):
         return Step((*trials, *rest), trim, steady_rivals(trim, [t for t in trials if rivals(t, counted=counted)]))
-    if not trials or not admitted(basis, trials[0]):
+    if not trials or not rivals(trials[0], counted=counted):
         return Step((*trials, *rest), None)
     trials, equals = compared_with_refitted_noise(basis, trials, say=say)
-    taken = name_of(equals, counted=counted)
-    return Step((*trials, *rest), taken, group_of(taken, equals, trials, counted=counted))
-
-
-def admitted(basis: Basis, trial: Trial) -> bool:
-    """Whether a trial has the evidence and the significance to be taken."""
-    enough = separate_evidence(trial, counted=basis.held_out is not None) > SELECTION.min_evidence
-    return enough and is_significant(basis.point, trial.p_value)
+    return Step((*trials, *rest), equals[0], tuple(t for t in equals[1:] if not _same_effect(t, equals[0])))
 
 
 def select(
@@ -275,7 +263,7 @@ def select(
     nominal = fitted.point if begun is None else begun.nominal
     point, value = fitted.point, fitted.loglik
     accepted: list[Candidate] = [] if begun is None else list(begun.accepted)
-    steps: list[Step] = [] if begun is None else [s for s in begun.steps if s.taken]
+    steps: list[Step] = [] if begun is None else list(begun.steps)
     apart, held_value = held_out_value(held_out, point, accepted)
     first = len(accepted)
     while True:
@@ -308,21 +296,31 @@ def select(
             continue
         point, value = fitted.point, fitted.loglik
         if is_nonphysical(point, accepted):  # `diagnose` reports that
-            return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates))
+            return Selection(nominal, point, tuple(steps), tuple(accepted), fitted)
         apart, held_value = held_out_value(held_out, point, accepted)
     found = {c.effect for c in accepted}
-    whole = Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates))
-    chosen = pruned(data, nominal_point, whole, held_out, say)
+    reasons = begun.left_out if begun else {}
+    whole = Selection(nominal, point, tuple(steps), tuple(accepted), fitted, reasons)
+    chosen = pruned(data, whole, held_out, say)
     gone = found - {c.effect for c in chosen.accepted}
-    if len(found) < SELECTION.max_effects or not gone:  # else there is room for more now
+    if not hid_another(whole.steps, gone, counted=held_out is not None):
         return chosen
     rest = [c for c in candidates if c.effect not in gone]
     return select(data, nominal_point, rest, held_out=held_out, begun=chosen, say=say)
 
 
+def hid_another(steps: Sequence[Step], gone: set[str], *, counted: bool) -> bool:
+    """Whether effects that are left out again may have hidden another: one was found after them, or they had rivals."""
+    taken = [s for s in steps if s.taken]
+    first = next((i for i, s in enumerate(taken) if s.taken and s.taken.candidate.effect in gone), len(taken))
+    after = [s.taken.candidate.effect for s in taken[first:] if s.taken]
+    others = [t.candidate.effect for s in taken[first : first + 1] for t in s.trials if rivals(t, counted=counted)]
+    return any(name not in gone for name in (*after, *others))
+
+
 def shortlist(linear: Sequence[tuple[Trial, Solution]]) -> list[tuple[Trial, Solution]]:
     """The trials to be fitted: those of the largest gains and those of the largest evidence, one start of each."""
-    sound = [t for t in linear if t[0].evidence > 2.0 and t[0].p_value < 0.03]
+    sound = [t for t in linear if t[0].evidence > 2.0]
     chosen: list[tuple[Trial, Solution]] = []
     least = SELECTION.gain_share * max((t.gain for t, _ in sound), default=0.0)
     by_gain = sorted(sound, key=lambda t: 2 * len(t[0].candidate.free) - t[0].gain)
@@ -385,7 +383,7 @@ def compared_with_refitted_noise(
     rest = [t for t in trials if all(t is not e for e in equals)]
     trials = by_evidence([*again, *rest], counted=counted)
     close = [t for t in trials if any(t.candidate is a.candidate for a in again)]
-    explain = [t for t in close if t is close[0] or admitted(basis, t)]
+    explain = [t for t in close if t is close[0] or rivals(t, counted=counted)]
     # by the evidence on all flights: slow flights do not determine a drag
     best = max(explain, key=lambda t: t.worth)
     return trials, alike_with(best, close, counted=counted)
@@ -397,27 +395,10 @@ def alike_with(best: Trial, trials: Sequence[Trial], *, counted: bool) -> list[T
     return [best, *(t for t in others if not distinguishable(best, t))]
 
 
-def group_of(taken: Trial, equals: Sequence[Trial], trials: Sequence[Trial], *, counted: bool) -> tuple[Trial, ...]:
-    """Look-alikes of the best trial and of the trial that gives the name, which may be two: a ground effect may beat a
-    lag that the named delay does not beat."""
-    more = [t for t in alike_with(taken, trials, counted=counted) if all(t is not e for e in equals)]
-    return tuple(t for t in (*equals, *more) if t.candidate.effect != taken.candidate.effect)
-
-
-def name_of(equals: Sequence[Trial], *, counted: bool) -> Trial:
-    """The look-alike that gives the name: the simplest that no other beats (`SELECTION.beaten`).
-
-    By the scatter over blocks alone. The scatter between recordings is known from few recordings; it widens a group,
-    but must not name an effect that loses by hundreds of nats.
-    """
-    near = [t for t in equals if t is equals[0] or not distinguishable(equals[0], t, recordings=False)]
-    simplest = min(undominated(near), key=lambda t: (len(t.candidate.free), -t.evidence), default=equals[0])
-    return simplest if separate_evidence(simplest, counted=counted) > SELECTION.min_evidence else equals[0]
+def _same_effect(one: Trial, other: Trial) -> bool:
+    return one.candidate.effect == other.candidate.effect
 
 
 def rivals(trial: Trial, *, counted: bool) -> bool:
-    """Whether a fitted candidate is an explanation: significant or with the evidence to be admitted, and with positive
-    evidence on all flights."""
-    evidence = separate_evidence(trial, counted=counted)
-    sure = trial.p_value < SELECTION.p_value or (trial.p_value < 1.0 and evidence > SELECTION.min_evidence)
-    return trial.fitted is not None and sure and evidence > 0
+    """Whether a candidate is an explanation: it exceeds its detection limit and has enough evidence on all flights."""
+    return trial.admissible and separate_evidence(trial, counted=counted) > SELECTION.min_evidence

@@ -98,8 +98,3 @@ def without_trim_rivals(candidates: Sequence[Candidate], accepted: Sequence[Cand
         elif effect.amplitude:
             kept.append(replace(c, free=(effect.amplitude,)))
     return kept
-
-
-def onset_p_value(point: Point, p_value: float, blocks: int) -> float:
-    """The p-value of an onset, times the number of blocks with a trim in the file: no later test follows there."""
-    return min(1.0, p_value * blocks) if TRIM in point.vehicle.effects else p_value

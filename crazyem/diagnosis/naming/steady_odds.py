@@ -114,7 +114,7 @@ def steady_selection(
         return None
     odds = float(logit(min(chance[best], 1.0 - 1e-12)))
     gain = fitted.loglik - before.loglik
-    trial = Trial(candidate, gain, max(odds, 0.0), 1.0, 1.0 - chance[best], odds, fitted, log_odds=odds, size=size)
+    trial = Trial(candidate, gain, max(odds, 0.0), 1.0, odds, fitted, admissible=True, log_odds=odds, size=size)
     alike = tuple(
         replace(trial, candidate=other, fitted=None)
         for other in asked
@@ -122,7 +122,7 @@ def steady_selection(
         and any(_is(other, name) and p > CONFIDENCE.min_look_alike for name, p in chance.items())
     )
     step = Step((trial, *alike), trial, alike)
-    return Selection(before.point, fitted.point, (step,), (candidate,), fitted, len(asked))
+    return Selection(before.point, fitted.point, (step,), (candidate,), fitted)
 
 
 def decided_by_balance(vehicle: Vehicle, candidate: Candidate) -> bool:

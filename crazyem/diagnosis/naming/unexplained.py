@@ -77,7 +77,7 @@ def unexplained(data: Data, selection: Selection, after: Located, apart: Data | 
     """Unexplained structure of the final model, and the gain of the effects; random torques by held-out flights too."""
     point = selection.final
     # nuisances adapt to a vibration, so the search for vibrations has them at their values in the vehicle file
-    named = {c.effect: point.effects[c.effect] for c in selection.accepted if c.effect not in selection.doubtful}
+    named = {c.effect: point.effects[c.effect] for c in selection.accepted}
     filed = replace(point, effects={**point.vehicle.effects, **named})
     # body axes only: `place.py` tests forces along axes of the room, and `wind` is an effect of the catalogue
     of_the_body = [f for f in after.findings if f.axis in AXES]
