@@ -166,7 +166,7 @@ BETWEEN = np.sqrt(ALONE * SECOND)
         (0.4 * ALONE, 0.5 * ALONE, ["payload", "linear_drag"]),  # whatever was found first
     ],
 )
-def test_the_least_probable_goes_first_and_the_others_are_judged_again(pruned, first, second, said):
+def test_the_least_probable_goes_first_and_the_others_are_with_conditional_gains(pruned, first, second, said):
     load, drag = trial("payload"), trial("linear_drag", ("x",))
     lost = {load.candidate: first, drag.candidate: second}
     _, gone = pruned(selection_of(load, drag), lambda accepted, c: (lost[c], 0.0), held_out=False)
@@ -242,7 +242,7 @@ def test_each_effect_is_judged_beside_all_the_others(monkeypatch):
         prune, "dispersion_of", lambda fitted, count, *, offset: columns.append((count, offset)) or 1.0 + count
     )
     data = SimpleNamespace(loglik=lambda point, passes: 1.0, workers=Workers(1))
-    found, without = prune.judged_again(data, SimpleNamespace(), selection_of(drag, scale))
+    found, without = prune.with_conditional_gains(data, SimpleNamespace(), selection_of(drag, scale))
     assert without == [bare[drag.candidate][0], bare[scale.candidate][0]]
     assert columns == [(3, 0), (1, 3)]
     judged = [(s.taken.gain, s.taken.held_out, s.taken.expected, s.taken.dispersion) for s in found.steps[:-1]]

@@ -300,7 +300,7 @@ def with_change(point: Point, candidates: Sequence[Candidate], change: NDArray) 
 
 def refine(
     data: Data,
-    start: Point,
+    point: Point,
     candidates: Sequence[Candidate],
     *,
     nuisances: Sequence[tuple[Candidate, tuple[float, ...]]] = (),
@@ -308,13 +308,12 @@ def refine(
     rounds: int = FITTING.rounds,
     noise: bool = True,
 ) -> Fitted:
-    """Maximum of the posterior near `start`, a model that contains the effects of the candidates.
+    """Maximum of the posterior near a point, a model that contains the effects of the candidates.
 
     The `nuisances` are free, with normal or Student's t priors (`Candidate.freedom`) about neutral or about `about`.
 
-    Raises: DivergedError if the filter leaves the range of numbers at `start`.
+    Raises: DivergedError if the filter leaves the range of numbers at the point.
     """
-    point = start
     free = [*candidates, *(c for c, _ in nuisances)]
     own = sum(len(c.free) for c in candidates)
     weight = np.array([0.0] * own + [w for _, precision in nuisances for w in precision])
@@ -338,8 +337,7 @@ def refine(
         low, high = nuisance_bounds(*bounds_of(free, point), away(point), weight, freedom)
         local = local_precision(away(point), weight, freedom)
         best = gram.solve(range(gram.size), low=low, high=high, precision=local, prior=-away(point))
-        before = value
-        near = best.gain < FITTING.min_round_gain
+        before, near = value, best.gain < FITTING.min_round_gain
         if near:  # the linear approximation is exact enough
             point, value, gram = with_change(point, free, best.theta), value + best.gain, gram.moved(best.theta)
         for k in range(0 if near else FITTING.tries):
@@ -358,5 +356,5 @@ def refine(
                 point, value, gram = better, found, slopes
         if gained < FITTING.min_round_gain:
             break
-    precision = local_precision(away(point), weight, freedom)
-    return Fitted(point, tuple(candidates), value, gram, precision, tuple(c for c, _ in nuisances))
+    local = local_precision(away(point), weight, freedom)
+    return Fitted(point, tuple(candidates), value, gram, local, tuple(c for c, _ in nuisances))

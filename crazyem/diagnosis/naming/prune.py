@@ -31,7 +31,7 @@ def pruned(data: Data, selection: Selection, held_out: Data | None, say: Callabl
     """
     held_out = held_out and held_out_twin(held_out, selection.final, selection.accepted)
     while selection.accepted:
-        selection, bare = judged_again(data, held_out, selection)
+        selection, bare = with_conditional_gains(data, held_out, selection)
         taken = [s.taken for s in selection.steps if s.taken]
         doubtful = [
             (trial.presence(1), trial.presence(order), candidate, less)
@@ -61,7 +61,7 @@ def _fit_of_others(data: Data, selection: Selection, less: Fitted, candidate: Ca
     return fitted
 
 
-def judged_again(data: Data, held_out: Data | None, selection: Selection) -> tuple[Selection, list[Fitted]]:
+def with_conditional_gains(data: Data, held_out: Data | None, selection: Selection) -> tuple[Selection, list[Fitted]]:
     """The selection with the gain of each effect beside all the others, and the fits without each."""
     fitted, accepted = selection.fitted, selection.accepted
     here = data.loglik(fitted.point, passes=2)

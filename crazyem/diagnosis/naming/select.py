@@ -66,15 +66,14 @@ def linear_trials(
         columns += added
     gram = data.gram(point, columns)
     always = [i for group in index[: len(base)] for i in group]
-    low = np.array([b for c in base for b in c.bounds(point)[0]])
-    high = np.array([b for c in base for b in c.bounds(point)[1]])
+    wide_low = np.array([b for c in base for b in c.bounds(point)[0]])
+    wide_high = np.array([b for c in base for b in c.bounds(point)[1]])
     away = [c.neutral(point)[n] - c.values(point)[n] for c, _ in free for n in c.free]
     centre = np.array([0.0 for c in accepted for _ in c.free] + away)
     freedom = np.append(np.full(len(centre) - len(away), np.inf), freedom_of([c for c, _ in free]))
     weights = np.array([0.0 for c in accepted for _ in c.free] + [w for _, p in free for w in p])
     weights = local_precision(centre, weights, freedom)
-    wide_low, wide_high = low, high
-    low, high = nuisance_bounds(low, high, -centre, weights, freedom)
+    low, high = nuisance_bounds(wide_low, wide_high, -centre, weights, freedom)
     zero = gram.solve(always, precision=weights, prior=centre, low=low, high=high) if always else None
     gain0, held0 = (zero.gain, zero.held_out) if zero else (0.0, 0.0)
     found = []
