@@ -122,7 +122,7 @@ def test_a_wrong_file_is_corrected_by_a_flight(tmp_path: Path) -> None:
     assert fitted.posterior is not None
     assert parse_vehicle(fitted.to_toml()) == fitted
     row = fitted.posterior.parameters.index("thrust_scale.scale")
-    sd = found.diagnosis.effects[0].parameters["scale"].sd
+    sd = next(e for e in found.diagnosis.effects if e.name == "thrust_scale").parameters["scale"].sd
     assert np.sqrt(fitted.posterior.covariance[row][row]) == pytest.approx(sd, rel=1e-3)
     drawn = sample(fitted, 20, days=False, mass_sd=0.0).arrays()["thrust_per_speed2"]
     assert np.isclose(drawn.mean(), ROTOR_CONSTANT, rtol=0.02)
