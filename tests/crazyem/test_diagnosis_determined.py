@@ -189,6 +189,7 @@ def test_an_effect_that_is_found_and_improbable_is_said_with_the_reason() -> Non
     found = diagnose([flown], DRONE, wanted=["linear_drag"], say=said.append)
     assert sum("found linear_drag" in text for text in said) == 1
     assert sum("left out again" in text for text in said) == 1
+    assert sum("looking for effect" in text for text in said) == 2  # and not again: it cannot have hidden anything
     assert found.effects == ()
     assert found.fitted_vehicle == DRONE
     assert not found.mismatch

@@ -136,7 +136,7 @@ def test_a_place_ahead_by_the_drones_own_speed_is_no_error(slow, verdict):
     assert watch.judge(t)[0] == verdict
 
 
-def test_writes_that_follow_each_other_are_with_conditional_gainsst_the_time_before_the_first():
+def test_writes_that_follow_each_other_are_judged_against_the_time_before_the_first():
     watch = written()
     assert fly(watch, WRITE, 0.5, error=0.13)[0] == ""
     watch.on_write(WRITE + 0.5, WRITE + 0.53)

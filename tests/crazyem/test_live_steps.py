@@ -196,7 +196,7 @@ def test_an_estimator_that_stalls_in_a_step_does_not_blind_the_watch():
     assert fly(watch, 6.1, 8.0, error=0.4)[0] == "worse"
 
 
-def test_after_a_gust_it_is_with_conditional_gains():
+def test_after_a_gust_it_is_judged_again():
     watch = written()
     assert fly(watch, WRITE, 1.0)[0] == ""
     watch.on_mass_step(began=6.0, now=6.1, real=None)

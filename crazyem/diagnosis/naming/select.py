@@ -264,7 +264,7 @@ def select(
     accepted: list[Candidate] = [] if begun is None else list(begun.accepted)
     steps: list[Step] = [] if begun is None else list(begun.steps)
     apart, held_value = held_out_value(held_out, point, accepted)
-    first = len(accepted)
+    first, reasons = len(accepted), begun.left_out if begun else {}
     while True:
         rest = [c for c in candidates if compatible(c.effect, {a.effect for a in accepted})]
         rest = without_trim_rivals(rest, accepted)
@@ -295,10 +295,9 @@ def select(
             continue
         point, value = fitted.point, fitted.loglik
         if is_nonphysical(point, accepted):  # `diagnose` reports that
-            return Selection(nominal, point, tuple(steps), tuple(accepted), fitted)
+            return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, reasons)
         apart, held_value = held_out_value(held_out, point, accepted)
     found = {c.effect for c in accepted}
-    reasons = begun.left_out if begun else {}
     whole = Selection(nominal, point, tuple(steps), tuple(accepted), fitted, reasons)
     chosen = pruned(data, whole, held_out, say)
     gone = found - {c.effect for c in chosen.accepted}
