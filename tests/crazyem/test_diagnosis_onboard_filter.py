@@ -152,18 +152,6 @@ def test_a_log_that_is_late_does_not_tilt_the_filter_on_board():
         assert np.allclose(together, alone + shown(**other), atol=1e-12) == adds_up
 
 
-def test_a_late_state_of_a_filter_on_board_is_found():
-    """Position, velocity and attitude of a made flight as they were 20 ms ago; the filter may lack the drag."""
-    recording = fly(seconds=12.0, seed=5, rate_noise=2e-3)
-    for name in ("position", "velocity", "attitude"):
-        recording = behind(recording, name, 0.02)
-    data = Data([replace(flight_of(recording, DRONE), fused=True)])
-    late = Candidate("measurement_delay", (("streams", ("state",)),), ("delay",))
-    point = nominal(data, Point(DRONE, {}, start_noise()))
-    fitted = refine_base(data, point.with_effects({"measurement_delay": late.neutral(point)}), [late])
-    assert fitted.point.effects["measurement_delay"]["delay"] == pytest.approx(0.02, abs=1.5e-3)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "parameter", "lags"), [("body_rate", "rate_lag", (0.0, 2e-3)),
                                                          ("velocity", "velocity_lag", (0.0, 1.5e-3))])  # fmt: skip

@@ -62,19 +62,17 @@ def _prior_covariance(candidates: Sequence[Candidate]) -> NDArray:
 
 @dataclass(frozen=True)
 class Joint:
-    """An effect on held-out flights, and as if it were fitted to all flights.
+    """Effects as if they were fitted to all flights.
 
     Attributes:
-        gain: further gain if it were fitted to both sets of flights [nats].
+        gain: further gain if they were fitted to both sets of flights [nats].
         blocks: (b,) log-likelihood of the held-out flights then.
         covariance: (k, k) `posterior_covariance` of the accepted parameters by both sets.
-        expected: mean gain on the held-out flights if the last effect is real and as large as fitted [nats].
     """
 
     gain: float
     blocks: NDArray
     covariance: NDArray
-    expected: float
 
 
 def expected_gain(information: NDArray, own: slice, away: NDArray, spread: NDArray) -> float:
@@ -97,7 +95,7 @@ def expected_gain(information: NDArray, own: slice, away: NDArray, spread: NDArr
 
 
 def joint_gain(fitted: Fitted, held_out: Data, there: Fitted, accepted: Sequence[Candidate]) -> Joint:
-    """The last of the accepted effects on held-out flights, and as if it were fitted to all flights.
+    """The accepted effects as if they were fitted to all flights.
 
     One step starts at `there`, the fit of the held-out flights with the effect as `fitted`. The curvature at `fitted`
     is the prior of the effect's parameters. A parameter that is also a nuisance may differ between the two sets, by its
@@ -109,7 +107,6 @@ def joint_gain(fitted: Fitted, held_out: Data, there: Fitted, accepted: Sequence
     own, parts = sum(len(c.free) for c in accepted), [*accepted, *(c for c, _ in free)]
     score, information = _total(held_out, there.point, parts)
     apart = {(c.effect, n): w for c, p in nuisances(held_out, there.point, ()) for n, w in zip(c.free, p, strict=True)}
-    last = slice(own - len(accepted[-1].free), own)
     paid = np.array([apart.get((c.effect, n), 0.0) for c in accepted for n in c.free])
     away = np.array([
         *(c.values(there.point)[n] - c.values(fitted.point)[n] for c in accepted for n in c.free),
@@ -120,9 +117,6 @@ def joint_gain(fitted: Fitted, held_out: Data, there: Fitted, accepted: Sequence
     known = np.diag(local_precision(away, usual, freedom))
     differing = np.divide(1.0, paid, out=np.zeros(own), where=paid > 0.0)
     curvature = fitted.gram.total(range(fitted.gram.size))[1] + np.diag(fitted.precision)
-    here, neutral = accepted[-1].values(fitted.point), accepted[-1].neutral(fitted.point)
-    size = np.array([here[n] - neutral[n] for n in accepted[-1].free])
-    expected = expected_gain(information + known, last, size, np.sqrt(differing[last]))
     known[:own, :own] = _inverse(_inverse(curvature)[:own, :own] + np.diag(2.0 * differing))
     back = 0.5 * float(paid @ np.square(away[:own]) - away[:own] @ known[:own, :own] @ away[:own])
     rest = score - known @ away
@@ -132,7 +126,7 @@ def joint_gain(fitted: Fitted, held_out: Data, there: Fitted, accepted: Sequence
     gain = float(rest @ step - 0.5 * step @ (information + known) @ step)
     blocks, covariance = held_out.block_loglik(there.point), posterior_covariance(accepted, information + known)
     if gain < SELECTION.linear_gain:
-        return Joint(back + gain, blocks, covariance, expected)
+        return Joint(back + gain, blocks, covariance)
     # a linear gain this large is unreliable: the likelihood after the step decides
     looked = held_out.twin()
     begin, best = looked.loglik(there.point) - 0.5 * float(away @ known @ away), 0.0
@@ -146,7 +140,7 @@ def joint_gain(fitted: Fitted, held_out: Data, there: Fitted, accepted: Sequence
             # the scatter of a comparison is that after the step: a right drag fitted to a hover fits quick flight so
             # badly that all rivals would be its look-alikes
             best, blocks = brought, looked.block_loglik(point)
-    return Joint(back + min(best, gain), blocks, covariance, expected)
+    return Joint(back + min(best, gain), blocks, covariance)
 
 
 def accepted_covariance(fitted: Fitted, accepted: Sequence[Candidate]) -> NDArray:

@@ -197,7 +197,6 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
     gain = fit.loglik - basis.value
     blocks, recording = data.block_loglik(fit.point), data.recordings_of_blocks()
     held, value, mine = trial.held_out, gain, [*basis.accepted, trial.candidate]
-    expected = 0.0  # blocks of the same flight confirm nothing
     if basis.held_out:
         apart = basis.held_out.twin()
         there = held_out_fit(apart, fit.point, mine)
@@ -206,7 +205,7 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
         blocks = np.append(blocks, joint.blocks)
         recording = np.append(recording, len(data.models) + apart.recordings_of_blocks())
         value += held + joint.gain
-        covariance, expected = joint.covariance, joint.expected
+        covariance = joint.covariance
     else:
         covariance = accepted_covariance(fit, mine)
     k = len(trial.candidate.free)
@@ -214,7 +213,6 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
         trial,
         gain=gain,
         held_out=held,
-        expected=expected,
         dispersion=dispersion_of(fit, k, offset=sum(len(c.free) for c in basis.accepted)),
         admissible=exceeds_limit(fit.point, trial.candidate, data),
         fitted=fit,

@@ -24,7 +24,8 @@ class Trial:
         candidate: which.
         gain: log-likelihood with the candidate less that without it [nats], on the fitted flights.
         held_out: the same on held-out flights; without such flights, on held-out blocks.
-        expected: mean of `held_out` if the effect is real and as large as fitted; 0 without held-out flights.
+        expected: mean of `held_out` if the effect is real and as large as fitted, from the elimination on (`prune`); 0
+            without held-out flights, because blocks of the fitted flights confirm nothing.
         dispersion: variance of the scores over that of the model.
         admissible: whether a fitted effect exceeds its detection limit and is not at the end of its range.
         evidence: (gain + held_out) over dispersion, less the number of parameters.
