@@ -10,7 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.fitting.model import Model, Point
 from crazyem.diagnosis.fitting.noise import start_noise
-from crazyem.diagnosis.fitting.situation import causal_middle, impulses
+from crazyem.diagnosis.fitting.situation import (
+    causal_middle,
+    impulses,
+    initial_path,
+    unmeasured,
+    with_interpolated_states,
+)
 from crazyem.diagnosis.flights.flight import flight_of
 
 seeds = st.integers(0, 2**32 - 1)
@@ -52,6 +58,26 @@ def test_what_measurements_brought(seed):
     body = Rotation.from_quat(filtered[:, 6:10]).inv().apply(filtered[:, 3:6] - predicted[:, 3:6])
     expected = np.concatenate([body, filtered[:, 10:13] - predicted[:, 10:13]], 1) + step[:, None] * filtered[:, 13:19]
     np.testing.assert_allclose(found, np.where(starts[:, None], 0.0, expected), atol=1e-13)
+
+
+def test_after_a_restart_nothing_counts_before_it_is_measured():
+    """A log of mixed rates with restarts, against a loop over rows: unmeasured states are those of the measurements
+    before and after, and the first measurement after a restart says nothing of the model."""
+    flight = flight_of(fly(seconds=5.0), DRONE)
+    rng, y = np.random.default_rng(1), flight.y.copy()
+    for columns in (slice(0, 6), slice(6, 10)):
+        y[rng.random(len(y)) < 0.7, columns] = np.nan
+    flight = replace(flight, y=y, starts=flight.starts | (rng.random(len(y)) < 0.05))
+    found, seen = unmeasured(flight), np.zeros(4, bool)
+    for k in range(len(y)):
+        seen = (seen & (not flight.starts[k])) | np.isfinite(y[k, [0, 3, 6, 10]])
+        np.testing.assert_array_equal(found[k], ~seen)
+    states = np.full((len(y), 19), 7.0)
+    filled = with_interpolated_states(states, flight)
+    path = initial_path(flight)
+    np.testing.assert_array_equal(filled[:, 0], np.where(found[:, 0], path[:, 0], 7.0))
+    np.testing.assert_array_equal(filled[:, 9], np.where(found[:, 2], path[:, 9], 7.0))
+    assert (filled[:, 13:] == 7.0).all()
 
 
 def test_what_is_remembered_is_of_the_last_path():

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import OWN, Column, Model, Point, Swept
-from crazyem.diagnosis.fitting.noise import CurvatureCache, coloured, fit_noise, without_negligible
+from crazyem.diagnosis.fitting.noise import coloured, fit_noise, without_negligible
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.settings import FITTING
 from crazyem.diagnosis.workers import Workers
@@ -53,7 +53,6 @@ class Data:
     def __init__(self, flights: Sequence[Flight], workers: Workers | None = None) -> None:
         self.models = [Model(f) for f in flights]
         self.workers = workers or Workers(1)
-        self.curvatures = CurvatureCache()
         self.constrained: frozenset[str] = frozenset()  # nuisances that are not free here
         self.own: Point | None = None  # of held-out flights: their noise and the start values of their nuisances
 
@@ -67,7 +66,6 @@ class Data:
         """An independent copy: the same flights with the paths of the last pass."""
         twin = Data((), self.workers)
         twin.models = [m.twin() for m in self.models]
-        twin.curvatures = self.curvatures.copy()
         twin.constrained, twin.own = self.constrained, self.own
         return twin
 
@@ -135,13 +133,13 @@ class Data:
                 break
         return gram, now
 
-    def fit_noise(self, point: Point, *, near: bool = False) -> Point:
-        """The model with fitted noise scales; `near`: the start values are near the maximum."""
+    def fit_noise(self, point: Point) -> Point:
+        """The model with fitted noise scales."""
         parts = []
         for model in self.models:
             acceleration, _ = model.accelerations(point)
             parts.append((model.flight, acceleration, model.offsets(point, acceleration)))
-        found = fit_noise(parts, point.noise, near=near, workers=self.workers, curvatures=self.curvatures)
+        found = fit_noise(parts, point.noise, workers=self.workers)
         return replace(point, noise=found)
 
     def leave_out_wild(self, point: Point) -> int:
@@ -196,8 +194,7 @@ def has_large_offset(name: str, values: Mapping[str, Any]) -> bool:
 def nominal(data: Data, point: Point) -> Point:
     """The nominal model with fitted noise scales, and with torques with memory where the likelihood gains by them."""
     data.settle(point)
-    fitted = data.fit_noise(point)
-    fitted = data.fit_noise(replace(fitted, noise=coloured(fitted.noise, data.flights)), near=True)
+    fitted = data.fit_noise(replace(point, noise=coloured(point.noise, data.flights)))
     fitted = replace(fitted, noise=without_negligible(fitted.noise, data.flights))
     if data.leave_out_wild(fitted):
         data.settle(fitted)
@@ -221,7 +218,7 @@ def with_torque_memory(data: Data, point: Point) -> Point:
         if memory > 0:
             start = np.concatenate([point.noise.disturbance[:3], np.full(3, FITTING.start_torque)])
             noise = replace(point.noise, disturbance=start, memory=memory)
-            there = data.fit_noise(replace(point, noise=noise), near=True)
+            there = data.fit_noise(replace(point, noise=noise))
             data.settle(there)
             found = data.loglik(there)
             if found > value + needed:
@@ -234,7 +231,7 @@ def with_torque_memory_refit(data: Data, point: Point) -> Point:
     if not point.noise.disturbance[3:].any():
         return with_torque_memory(data, point)
     forces = np.concatenate([point.noise.disturbance[:3], np.zeros(3)])
-    white = data.fit_noise(replace(point, noise=replace(point.noise, disturbance=forces)), near=True)
+    white = data.fit_noise(replace(point, noise=replace(point.noise, disturbance=forces)))
     data.settle(white)
     chosen = with_torque_memory(data, white)
     data.settle(chosen)
@@ -350,7 +347,7 @@ def refine(
                 break
         gained = value - before
         if noise and (turn < 1 or gained > 2.0):
-            better = data.fit_noise(point, near=True)
+            better = data.fit_noise(point)
             found, slopes = look(better)
             if found > value:
                 point, value, gram = better, found, slopes

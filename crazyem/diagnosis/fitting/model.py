@@ -17,6 +17,8 @@ from crazyem.diagnosis.fitting.situation import (
     integrated_path,
     situation_of,
     thrust_of,
+    unmeasured,
+    with_interpolated_states,
     with_rotors,
 )
 from crazyem.diagnosis.fitting.sweeps import Noise, Swept, run_sweep
@@ -67,9 +69,11 @@ class Column:
 
 def filter_corrections(swept: Swept, flight: Flight) -> tuple[NDArray, NDArray, NDArray]:
     """Corrections of a pass of the filter to its model by steps: changes (n, 6) of velocity [m/s] and body rate
-    [rad/s], body axes; lengths (n,) of the steps [s]; whether they are known (n,). Unknown ones are 0."""
+    [rad/s], body axes; lengths (n,) of the steps [s]; whether they are known (n,). Unknown ones are 0.
+
+    The first measurement after a start corrects a guess, which says nothing of the model."""
     step = np.diff(flight.time, prepend=flight.time[0])
-    known = (step > 0) & ~flight.starts
+    known = (step > 0) & ~flight.starts & ~np.roll(unmeasured(flight).any(axis=1), 1)
     impulse = np.zeros((step.size, 6))
     impulses(swept.predicted, swept.filtered, step, known, impulse)
     return impulse, np.where(known, step, 0.0), known
@@ -244,8 +248,9 @@ class Model:
         if not np.isfinite(swept.filtered).all():  # the next model must not start from such states
             self.path = self.rows_path = self.observed_acceleration = self.observed_force = None
             return swept
-        self.path = causal_middle(swept.filtered, swept.predicted, flight.starts)
-        self.rows_path = under_relaxed(swept.filtered, self.rows_path, offset)
+        filtered, predicted = (with_interpolated_states(v, flight) for v in (swept.filtered, swept.predicted))
+        self.path = causal_middle(filtered, predicted, flight.starts)
+        self.rows_path = under_relaxed(filtered, self.rows_path, offset)
         found = filter_corrections(swept, flight)
         self.observed_acceleration = acceleration + missing_acceleration(*found)
         self.observed_force = observed_force(acceleration, *found)

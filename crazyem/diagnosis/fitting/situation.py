@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.compiled import compiled
-from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.flights.flight import COLUMNS, Flight
 from crazyem.estimation.kernels.algebra import matrix
 from crazyem.physics.effects.effect import Effects, Path, Situation
 from crazyem.physics.motion import rotor_thrust
@@ -27,6 +27,31 @@ def initial_path(flight: Flight) -> NDArray:
         path[:, 3:6] = np.gradient(path[:, 0:3], flight.time, axis=0)
     path[:, 6:10] /= np.linalg.norm(path[:, 6:10], axis=1, keepdims=True)
     return path
+
+
+def unmeasured(flight: Flight) -> NDArray:
+    """(n, 4) bool: whether position, velocity, attitude or body rate has no measurement since the filter's last start.
+
+    A quantity that the flight never measures counts as unmeasured at the starts alone.
+    """
+    row = np.arange(flight.time.size)
+    start = np.maximum.accumulate(np.where(flight.starts, row, 0))
+    found = np.empty((row.size, 4), bool)
+    for k, columns in enumerate(COLUMNS.values()):
+        shown = np.isfinite(flight.y[:, columns.start])
+        last = np.maximum.accumulate(np.where(shown, row, -1))
+        found[:, k] = last < start if shown.any() else flight.starts
+    return found
+
+
+def with_interpolated_states(states: NDArray, flight: Flight) -> NDArray:
+    """States (n, 19) of the filter, with measurements from before and after where none since its start is known."""
+    missing = np.repeat(unmeasured(flight), [c.stop - c.start for c in COLUMNS.values()], axis=1)
+    if not missing.any():
+        return states
+    filled = states.copy()
+    filled[:, :13] = np.where(missing, initial_path(flight)[:, :13], states[:, :13])
+    return filled
 
 
 def thrust_of(flight: Flight, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, NDArray]:
