@@ -175,6 +175,22 @@ def test_a_trim_that_is_asked_for_is_fitted_and_taken_before_a_better_weak_rotor
     assert step.taken.candidate.effect == "rotor_fault"
 
 
+def test_a_trial_whose_scores_scatter_does_not_end_the_search(monkeypatch) -> None:
+    """By the dispersion of all, a tilt of 110 nats is before a lag of 90; by its own of 60 the tilt explains nothing."""
+    fitted: Any = object()
+    tilt = Trial(Candidate("attitude_misalignment", (), ("roll",)), 110.0, 0.0, 60.0, 0.8, fitted, admissible=True)
+    lag = Trial(Candidate("motor_lag", (), ("time_constant",)), 90.0, 0.0, 2.0, 44.0, fitted, admissible=True)
+    monkeypatch.setattr(selecting, "fitted_trial", lambda basis, entry, solution, *, say: entry)
+    monkeypatch.setattr(selecting, "compared_with_refitted_noise", lambda basis, trials, *, say: (trials, trials[:1]))
+    data: Any = SimpleNamespace(workers=Workers(1))
+    basis = Basis(data, None, point_of(DRONE), (), 0.0, 0.0)
+    entries: Any = [(tilt, None), (lag, None)]
+    taken = step_of(basis, entries, say=lambda text: None).taken
+    assert taken is not None
+    assert taken.candidate is lag.candidate
+    assert step_of(basis, entries[:1], say=lambda text: None).taken is None
+
+
 def test_beside_a_trim_neither_a_weak_rotor_nor_the_place_of_a_load_is_asked_for() -> None:
     assert without_trim_rivals([WEAK, LATE, LOAD], []) == [WEAK, LATE, LOAD]
     assert without_trim_rivals([WEAK, LATE, LOAD], [ASKED]) == [LATE, replace(LOAD, free=("mass",))]

@@ -238,6 +238,8 @@ def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Call
     rest = [t for t, _ in linear if all(t.candidate is not p.candidate for p in trials)]
     if trim := next((t for t in trials if t.candidate.effect == TRIM and rivals(t, counted=counted)), None):
         return Step((*trials, *rest), trim, steady_rivals(trim, [t for t in trials if rivals(t, counted=counted)]))
+    # at the common dispersion, a trial may be the first whose own scores scatter so much that it explains nothing
+    trials = sorted(trials, key=lambda t: not rivals(t, counted=counted))
     if not trials or not rivals(trials[0], counted=counted):
         return Step((*trials, *rest), None)
     trials, equals = compared_with_refitted_noise(basis, trials, say=say)
