@@ -176,7 +176,7 @@ def test_a_trim_that_is_asked_for_is_fitted_and_taken_before_a_better_weak_rotor
 
 
 def test_a_trial_whose_scores_scatter_does_not_end_the_search(monkeypatch) -> None:
-    """By the dispersion of all, a tilt of 110 nats is before a lag of 90; by its own of 60 the tilt explains nothing."""
+    """By the common dispersion a tilt of 110 nats is before a lag of 90; by its own of 60, it explains nothing."""
     fitted: Any = object()
     tilt = Trial(Candidate("attitude_misalignment", (), ("roll",)), 110.0, 0.0, 60.0, 0.8, fitted, admissible=True)
     lag = Trial(Candidate("motor_lag", (), ("time_constant",)), 90.0, 0.0, 2.0, 44.0, fitted, admissible=True)
