@@ -89,11 +89,12 @@ class NoiseFit:
 
     rows: int = 1500  # of each flight for the fit of the scales; they know a scale to some 1 %
     stretch: int = 750  # rows without a gap; in short ones the filter starts often and velocities seem too accurate
+    rough_rows: int = 900  # the same for a first, rough fit
+    rough_stretch: int = 150  # rows of a stretch there
     log_sd: float = 2.0  # sd of the logarithm of a scale about its typical value: a factor of seven; assumed
-    tolerance: float = 1e-3  # nats of the last step; at 0.1, a scale that hardly shows is a factor of two off
-    max_steps: int = 200  # of the fit
-    max_deviation: float = 4.0  # sd of the prior of the logarithm, above which no scale is looked for
-    impossible: float = 1e15  # nats; cost of scales with which rounding makes a variance negative
+    max_steps: int = 40  # of scoring
+    log_step: float = 0.02  # of the logarithm, for differences
+    max_log_step: float = 1.5  # in scoring
     # Typical scales of a small quadrotor, by order of magnitude; the prior is a factor of seven to either side.
     impulse: tuple[float, float] = (0.1, 1.0)  # m/s^2 sqrt(s), rad/s^2 sqrt(s)
     disturbance: tuple[float, float] = (0.1, 1.0)  # m/s^2, rad/s^2
@@ -130,7 +131,7 @@ class Fitting:
     min_round_gain: float = 0.05  # nats; a smaller step is the last of a fit, by the linear approximation; assumed
     passes: int = 8  # until the physics is evaluated at the states of the filter
     pass_change: float = 0.2  # nats between two passes, below which they have converged
-    max_deviation: float = 4.0  # sd of its prior within which a nuisance stays: 99.99 % of a normal prior
+    max_deviation: float = 2.5  # sd of its prior within which a nuisance stays: 99 % of a normal prior
     within_reach: float = 0.99  # share of `max_deviation`; a nuisance within it is determined
     outlier: float = 4.0  # mean square of the standardised innovations of a step that is left out
     start_torque: float = 0.5  # rad/s^2; start value of torques with memory
@@ -200,7 +201,6 @@ class Selection:
 
     max_fitted: int = 6  # candidates of a turn
     min_fitted: int = 3  # candidates that are fitted whatever they gain
-    min_linear: float = 2.0  # nats of linear evidence or of the largest gain, with which one is fitted; assumed
     gain_share: float = 0.15  # of the largest linear gain, with which a candidate is fitted; assumed
     max_effects: int = 9  # real drones differ from their file in more than one thing
     noise_share: float = 0.8  # of the best gain, from which a trial gets its own noise; assumed

@@ -107,21 +107,6 @@ def test_coloured_errors_come_back_with_their_memory() -> None:
     assert not white.coloured.any()
 
 
-@pytest.mark.parametrize("memory", [0.05, 0.5])
-def test_the_maximum_does_not_depend_on_the_start(memory: float) -> None:
-    """Large torques with a memory, from white torques that already explain them: within 0.5 nats of the fit that starts
-    at the truth. The noise of commands sampled at 100 Hz is of this kind."""
-    there = replace(TRUE, disturbance=np.array([0.0, 0.0, 0.0, 6.0, 5.0, 1.0]), memory=memory)
-    there = replace(there, impulse=np.array([3e-3, 3e-3, 0.05, 0.1, 0.1, 0.1]), measurement=TRUE.measurement / 5)
-    flight, acceleration, offset = drawn(9, there)
-    white = fit_noise([(flight, acceleration, offset)], replace(START, memory=memory))
-    starts = there, replace(white, disturbance=np.array([0.0, 0.0, 0.0, 0.5, 0.5, 0.5]))
-    nothing = np.zeros((900, 6, 0)), np.zeros((900, 12, 0))
-    found = [fit_noise([(flight, acceleration, offset)], start) for start in starts]
-    one, other = (run_sweep(flight, acceleration, offset, *nothing, noise).loglik for noise in found)
-    assert other == pytest.approx(one, abs=0.5)
-
-
 def test_a_scale_that_nothing_measures_stays() -> None:
     flight, acceleration, offset = drawn(5, TRUE, rows=300)
     flight.y[:, 3:6] = np.nan

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import OWN, Column, Model, Point, Swept
-from crazyem.diagnosis.fitting.noise import coloured, fit_noise, without_negligible
+from crazyem.diagnosis.fitting.noise import CurvatureCache, coloured, fit_noise, without_negligible
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.settings import FITTING
 from crazyem.diagnosis.workers import Workers
@@ -53,6 +53,7 @@ class Data:
     def __init__(self, flights: Sequence[Flight], workers: Workers | None = None) -> None:
         self.models = [Model(f) for f in flights]
         self.workers = workers or Workers(1)
+        self.curvatures = CurvatureCache()
         self.constrained: frozenset[str] = frozenset()  # nuisances that are not free here
         self.own: Point | None = None  # of held-out flights: their noise and the start values of their nuisances
 
@@ -66,6 +67,7 @@ class Data:
         """An independent copy: the same flights with the paths of the last pass."""
         twin = Data((), self.workers)
         twin.models = [m.twin() for m in self.models]
+        twin.curvatures = self.curvatures.copy()
         twin.constrained, twin.own = self.constrained, self.own
         return twin
 
@@ -133,13 +135,13 @@ class Data:
                 break
         return gram, now
 
-    def fit_noise(self, point: Point) -> Point:
-        """The model with fitted noise scales."""
+    def fit_noise(self, point: Point, *, near: bool = False) -> Point:
+        """The model with fitted noise scales; `near`: the start values are near the maximum."""
         parts = []
         for model in self.models:
             acceleration, _ = model.accelerations(point)
             parts.append((model.flight, acceleration, model.offsets(point, acceleration)))
-        found = fit_noise(parts, point.noise, workers=self.workers)
+        found = fit_noise(parts, point.noise, near=near, workers=self.workers, curvatures=self.curvatures)
         return replace(point, noise=found)
 
     def leave_out_wild(self, point: Point) -> int:
@@ -194,7 +196,8 @@ def has_large_offset(name: str, values: Mapping[str, Any]) -> bool:
 def nominal(data: Data, point: Point) -> Point:
     """The nominal model with fitted noise scales, and with torques with memory where the likelihood gains by them."""
     data.settle(point)
-    fitted = data.fit_noise(replace(point, noise=coloured(point.noise, data.flights)))
+    fitted = data.fit_noise(point)
+    fitted = data.fit_noise(replace(fitted, noise=coloured(fitted.noise, data.flights)), near=True)
     fitted = replace(fitted, noise=without_negligible(fitted.noise, data.flights))
     if data.leave_out_wild(fitted):
         data.settle(fitted)
@@ -218,7 +221,7 @@ def with_torque_memory(data: Data, point: Point) -> Point:
         if memory > 0:
             start = np.concatenate([point.noise.disturbance[:3], np.full(3, FITTING.start_torque)])
             noise = replace(point.noise, disturbance=start, memory=memory)
-            there = data.fit_noise(replace(point, noise=noise))
+            there = data.fit_noise(replace(point, noise=noise), near=True)
             data.settle(there)
             found = data.loglik(there)
             if found > value + needed:
@@ -231,7 +234,7 @@ def with_torque_memory_refit(data: Data, point: Point) -> Point:
     if not point.noise.disturbance[3:].any():
         return with_torque_memory(data, point)
     forces = np.concatenate([point.noise.disturbance[:3], np.zeros(3)])
-    white = data.fit_noise(replace(point, noise=replace(point.noise, disturbance=forces)))
+    white = data.fit_noise(replace(point, noise=replace(point.noise, disturbance=forces)), near=True)
     data.settle(white)
     chosen = with_torque_memory(data, white)
     data.settle(chosen)
@@ -347,7 +350,7 @@ def refine(
                 break
         gained = value - before
         if noise and (turn < 1 or gained > 2.0):
-            better = data.fit_noise(point)
+            better = data.fit_noise(point, near=True)
             found, slopes = look(better)
             if found > value:
                 point, value, gram = better, found, slopes

@@ -1,13 +1,17 @@
-"""Noise scales of a model: the maximum of their posterior density, by the exact score (`noise_score.py`)."""
+"""Noise scales of a model: Fisher scoring on the innovations of the flight.
+
+The score is exact (`noise_score.py`). The information is sum 1/2 (ds/s)^2 + de^2/s, with de, ds by differences
+(Cavanaugh and Shumway 1996, for a Gaussian innovations form). It costs a pass of the filter for each scale. So it is
+computed once, and each step updates it (BFGS; Nocedal and Wright, Numerical Optimization, ch. 6).
+"""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
-from crazyem.diagnosis.fitting.sweeps import Noise, scored_sweep
+from crazyem.diagnosis.fitting.sweeps import Noise, Swept, run_sweep, scored_sweep
 from crazyem.diagnosis.flights.flight import COLUMNS, Flight
 from crazyem.diagnosis.settings import NOISE
 from crazyem.diagnosis.workers import Workers
@@ -81,47 +85,127 @@ def sample_rows(flight: Flight, *, rows: int = NOISE.rows, stretch: int = NOISE.
 
 
 def start_noise() -> Noise:
-    """Start values of the fit."""
+    """Start values of scoring."""
     return Noise(np.array([0.3, 0.3, 0.5, 5.0, 5.0, 5.0]), np.array([3e-3, 3e-2, 1e-2, 3e-2]))
+
+
+@dataclass
+class CurvatureCache:
+    """Known curvatures (k, k) by the noise scales, for sets of flights and of free scales."""
+
+    known: dict[tuple[object, ...], NDArray] = field(default_factory=dict)
+
+    def copy(self) -> "CurvatureCache":
+        """An independent copy."""
+        return CurvatureCache(dict(self.known))
 
 
 Part = tuple[Flight, NDArray, NDArray]  # a flight, its accelerations (n, 6) and offsets (n, 12)
 
 
-def fit_noise(parts: list[Part], start: Noise, *, workers: Workers | None = None) -> Noise:
+def fit_noise(
+    parts: list[Part],
+    start: Noise,
+    *,
+    near: bool = False,
+    tolerance: float = 0.2,
+    workers: Workers | None = None,
+    curvatures: CurvatureCache | None = None,
+) -> Noise:
     """Noise scales of highest posterior density, for given accelerations (n, 6) and offsets (n, 12) of each flight.
 
-    By L-BFGS-B with the exact score, within `NOISE.max_deviation` of typical scales. Scales of quantities that are not
-    measured stay. Disturbances are fitted where they start above 0. Long flights count by stretches (`sample_rows`).
+    Scales of quantities that are not measured stay. Disturbances are fitted where they start above 0. Unless the start
+    is `near`, a rough fit to few rows comes first.
     """
-    workers = workers or Workers(1)
-    chosen = [(f.rows(keep), a[keep], o[keep]) for f, a, o in parts for keep in (sample_rows(f),)]
+    workers, curvatures = workers or Workers(1), curvatures or CurvatureCache()
+    if not near and any(f.time.size > NOISE.rough_rows for f, _, _ in parts):
+        few = [
+            (f.rows(k), a[k], o[k])
+            for f, a, o in parts
+            for k in (sample_rows(f, rows=NOISE.rough_rows, stretch=NOISE.rough_stretch),)
+        ]
+        start = _scored(few, start, 5 * tolerance, workers, CurvatureCache())
+    chosen = [(f.rows(keep), a[keep], o[keep]) for f, a, o in parts for keep in (sample_rows(f, rows=NOISE.rows),)]
+    return _scored(chosen, start, tolerance, workers, curvatures)
+
+
+def _scored(chosen: list[Part], start: Noise, tolerance: float, workers: Workers, curvatures: CurvatureCache) -> Noise:
     measured = np.zeros(4, bool)
     for flight, _, _ in chosen:
         measured |= np.array([np.isfinite(flight.y[:, c]).any() for c in FIRST])
     lasting = measured & (start.coloured > 0)
-    index = np.flatnonzero([*np.ones(6, bool), *measured, *(start.disturbance > 0), *lasting, *lasting])
+    free = np.concatenate([np.ones(6, bool), measured, start.disturbance > 0, lasting, lasting])
     logs, memory, floor = logs_of(start), start.memory, logs_of(SMALLEST)
     if any("attitude" not in f.signals and np.isfinite(f.y[:, 6]).any() for f, _, _ in chosen):
         floor[8] = np.log(NOISE.min_attitude)
-    typical, weight = logs_of(TYPICAL)[index], LOG_SD[index] ** -2.0
+    logs = np.maximum(logs, np.where(free, floor, -np.inf))
+    typical, index = logs_of(TYPICAL), np.flatnonzero(free)
+    weight = LOG_SD[index] ** -2.0
+    key = (*(f.time.size for f, _, _ in chosen), *index.tolist(), *np.atleast_1d(memory).tolist())
 
-    def noise_at(free: NDArray) -> Noise:
-        there = logs.copy()
-        there[index] = free
-        return noise_of(there, memory)
-
-    def cost(free: NDArray) -> tuple[float, NDArray]:
-        """Minus log posterior density, and its gradient."""
-        noise, away = noise_at(free), free - typical
-        found = workers.map(lambda part: scored_sweep(*part, noise), chosen)
+    def look(at: NDArray) -> tuple[float, NDArray, list[Swept]]:
+        """Log posterior density, its score and the passes of the flights."""
+        found = workers.map(lambda part: scored_sweep(*part, noise_of(at, memory)), chosen)
+        away = (at - typical)[index]
         value = sum(swept.loglik for swept, _ in found) - 0.5 * float(weight @ np.square(away))
         slope = np.sum([score[index] for _, score in found], axis=0) - weight * away
-        if not np.isfinite(value) or not np.isfinite(slope).all():  # rounding made a variance negative
-            return NOISE.impossible, np.zeros(index.size)
-        return -value, -slope
+        return value, slope, [swept for swept, _ in found]
 
-    begin = np.maximum(logs[index], floor[index])
-    options = {"ftol": NOISE.tolerance / max(1.0, abs(cost(begin)[0])), "maxiter": NOISE.max_steps}
-    bounds = list(zip(floor[index], typical + NOISE.max_deviation * LOG_SD[index], strict=True))
-    return noise_at(minimize(cost, begin, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x)
+    value, score, swept = look(logs)
+    for _ in range(NOISE.max_steps):
+        fresh = key not in curvatures.known
+        if fresh:
+            information = _information(chosen, swept, logs, memory, index, workers)
+            curvatures.known[key] = information + np.diag(weight)
+        curvature = curvatures.known[key]
+        step = np.clip(np.linalg.solve(curvature, score), -NOISE.max_log_step, NOISE.max_log_step)
+        for _ in range(5):
+            there = logs.copy()
+            there[index] = np.maximum(logs[index] + step, floor[index])
+            found, slope, passes = look(there)
+            if found > value - 1e-9:
+                break
+            step = step / 3
+        else:
+            if fresh:
+                break
+            del curvatures.known[key]
+            continue
+        gain, way = found - value, there[index] - logs[index]
+        curvatures.known[key] = _bfgs_update(curvature, way, score - slope)
+        promised = 0.5 * float(score @ way)
+        logs, value, score, swept = there, found, slope, passes
+        if max(gain, promised) < tolerance:
+            break
+    return noise_of(logs, memory)
+
+
+def _bfgs_update(curvature: NDArray, way: NDArray, change: NDArray) -> NDArray:
+    """The curvature (k, k) after a BFGS update: along the step `way` (k,), the score fell by `change` (k,)."""
+    along, before = float(way @ change), curvature @ way
+    if along <= 1e-3 * float(way @ before):
+        return curvature
+    return curvature + np.outer(change, change) / along - np.outer(before, before) / float(way @ before)
+
+
+def _information(
+    chosen: list[Part], here: list[Swept], logs: NDArray, memory: float | NDArray, index: NDArray, workers: Workers
+) -> NDArray:
+    """Information (k, k) of the scales `index` (k,) from all flights, by differences from the passes `here`."""
+
+    def sweep(at: NDArray) -> list[Swept]:
+        noise = noise_of(at, memory)
+        return [
+            run_sweep(f, a, o, np.zeros((f.time.size, 6, 0)), np.zeros((f.time.size, 12, 0)), noise)
+            for f, a, o in chosen
+        ]
+
+    moved = workers.map(sweep, logs + NOISE.log_step * np.eye(logs.size)[index])
+    information = np.zeros((index.size, index.size))
+    for part, base in enumerate(here):
+        seen = base.variance > 0
+        s, e = base.variance[seen], base.innovation[seen]
+        ds = np.stack([(m[part].variance[seen] - s) / NOISE.log_step for m in moved]) / s
+        de = np.stack([(m[part].innovation[seen] - e) / NOISE.log_step for m in moved]) / np.sqrt(s)
+        information += 0.5 * ds @ ds.T + de @ de.T
+    return information

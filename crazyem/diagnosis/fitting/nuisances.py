@@ -231,12 +231,13 @@ def held_out_twin(held_out: Data, point: Point, accepted: Sequence[Candidate]) -
     """A twin of held-out flights with its own noise scales and nuisances, fitted under this model.
 
     Noise belongs to a recording: between slow and fast flights, it makes thousands of nats. All models that are
-    compared start from the same fit; otherwise they end at different local maxima, which differ by ten nats.
+    compared start from the same fit; otherwise they end at different local maxima, which differ by ten nats. With a
+    trim in the file, the noise is that of the fitted flights, so that a steady torque does not become torque noise with
+    memory.
     """
     twin = held_out.twin()
     twin.own = None
-    begin = point if held_out.own is None else replace(point, noise=held_out.own.noise)
-    there = held_out_fit(twin, begin, accepted, noise=True).point
+    there = held_out_fit(twin, point, accepted, noise=TRIM not in point.vehicle.effects).point
     gone = {c.effect for c in accepted}
     twin.own = replace(there, effects={n: v for n, v in there.effects.items() if n not in gone})
     return twin

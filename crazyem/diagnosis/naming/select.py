@@ -317,14 +317,10 @@ def hid_another(steps: Sequence[Step], gone: set[str], *, counted: bool) -> bool
 
 
 def shortlist(linear: Sequence[tuple[Trial, Solution]]) -> list[tuple[Trial, Solution]]:
-    """The trials to be fitted: those of the largest gains and those of the largest evidence, one start of each.
-
-    The largest gain of all is among them though its scores scatter: fitted trials are compared at one dispersion.
-    """
-    largest = max((t.gain for t, _ in linear), default=0.0)
-    screen, least = SELECTION.min_linear, SELECTION.gain_share * largest
-    sound = [entry for entry in linear if entry[0].evidence > screen or entry[0].gain == largest > screen]
+    """The trials to be fitted: those of the largest gains and those of the largest evidence, one start of each."""
+    sound = [t for t in linear if t[0].evidence > 2.0]
     chosen: list[tuple[Trial, Solution]] = []
+    least = SELECTION.gain_share * max((t.gain for t, _ in sound), default=0.0)
     by_gain = sorted(sound, key=lambda t: 2 * len(t[0].candidate.free) - t[0].gain)
     for entry in [x for pair in zip(by_gain, sound, strict=True) for x in pair]:
         c = entry[0].candidate

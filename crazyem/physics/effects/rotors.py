@@ -52,11 +52,6 @@ def _strength(conditions: Conditions) -> Sizes:
     return {"scale": conditions.days[0] if conditions.days else 0.02}
 
 
-def _tails(conditions: Conditions) -> float:
-    """Degrees of freedom: the spread is known from some twelve days of two drones, so a normal tail is too short."""
-    return 8.0 if conditions.days is None else conditions.days[4]
-
-
 THRUST_SCALE = Effect(
     "thrust_scale",
     (Parameter("scale", "", 1.0, 0.1, 5.0, 0.01),),
@@ -68,7 +63,6 @@ THRUST_SCALE = Effect(
     prior=Prior(
         own={"scale": 0.08},
         usual=_strength,
-        freedom=_tails,
         each=lambda conditions: conditions.own_battery,
         detection_limit=lambda chosen, conditions: {n: 2.0 * sd for n, sd in _strength(conditions).items()},
     ),
@@ -164,6 +158,11 @@ def _of_the_day(conditions: Conditions) -> Sizes:
     if not conditions.individual_file:
         return {}
     return in_turn("x y z", *(conditions.days[1:4] if conditions.days else (5e-4, 5e-4, 1.6e-4)))
+
+
+def _tails(conditions: Conditions) -> float:
+    """Degrees of freedom: the spread is known from some twelve days of two drones, so a normal tail is too short."""
+    return 8.0 if conditions.days is None else conditions.days[4]
 
 
 TRIM = Effect(
