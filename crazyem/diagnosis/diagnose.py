@@ -115,9 +115,7 @@ def diagnose(
     selection, corroborated = _corroborated(data, apart, selection, request.recordings)
     selection, balance = by_balance(data, with_exact_torques(data, selection))
     judges = request.held_out or request.recordings
-    selection = without_worse_predictions(
-        data, selection, request.vehicle, judges, apart or data, withhold=withhold, say=say
-    )
+    selection = without_worse_predictions(data, selection, request.vehicle, judges, withhold=withhold, say=say)
     extra = {c.effect for c in request.extra}
     selection, balance, unsure = without_undetermined(data, selection, balance, say, extra=extra)
     before, after = _located(data, selection, say)
@@ -365,7 +363,7 @@ def _strengths(selection: Selection) -> dict[str, float]:
 
 def _with_effects(vehicle: Vehicle, selection: Selection, beside: Sequence[Named]) -> Vehicle:
     """The vehicle with the found effects; normal delays are left out."""
-    fitted = with_accepted_effects(vehicle, selection.final, selection.accepted)
+    fitted = with_accepted_effects(vehicle, selection, selection.accepted)
     return replace(
         fitted,
         effects={**fitted.effects, **{e.name: {n: v.value for n, v in e.parameters.items()} for e in beside}},

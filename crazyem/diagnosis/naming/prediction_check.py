@@ -3,9 +3,6 @@
 The likelihood judges predictions of one step. There a control loop that answers an unknown vibration or wind makes
 inertias, lags and torques look wrong: they gain thousands of nats, but spoil predictions within a tenth of a second. A
 real effect improves predictions, or leaves them as they are where it hardly matters.
-
-Trim and thrust of the day of each flight are fitted under each model: with the trim of another day, a drone turns over
-within half a second under the right model, too.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,11 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate
+from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data
-from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.nuisances import held_out_fit
-from crazyem.diagnosis.fitting.nuisances import without as without_effect
 from crazyem.diagnosis.flights.flight import without
 from crazyem.diagnosis.naming.prune import left_out
 from crazyem.diagnosis.naming.trials import Selection
@@ -34,7 +28,6 @@ def without_worse_predictions(
     selection: Selection,
     vehicle: Vehicle,
     recordings: Sequence[Recording],
-    flights: Data,
     *,
     withhold: Sequence[str] = (),
     say: Callable[[str], None] = lambda text: None,
@@ -43,23 +36,16 @@ def without_worse_predictions(
 
     Args:
         recordings: the held-out ones, or the fitted ones if there are none.
-        flights: of these recordings, in this order.
     """
     if data.coarse:  # the recorded commands lack the torques: no model predicts the rotation
         return selection
     shown = [without(r, withhold) for r in recordings]
-    each = flights.each()
-
-    def predicted(point: Point, accepted: Sequence[Candidate]) -> list[HorizonErrors | None]:
-        for candidate in selection.accepted:
-            point = point if candidate in accepted else without_effect(point, candidate.effect)
-        fitted = with_accepted_effects(vehicle, point, accepted)
-        return [_errors_of(r, _on_its_day(fitted, f, point, accepted)) for r, f in zip(shown, each, strict=True)]
+    nominal = [_errors_of(r, vehicle) for r in shown]
 
     def worse(accepted: Sequence[Candidate]) -> float:
-        return ratio(nominal, predicted(selection.final, accepted))
+        fitted = with_accepted_effects(vehicle, selection, accepted)
+        return ratio(nominal, [_errors_of(r, fitted) for r in shown])
 
-    nominal = predicted(selection.nominal, ())
     while selection.accepted and worse(selection.accepted) > SELECTION.max_error_ratio:
         rest = [[a for a in selection.accepted if a is not c] for c in selection.accepted]
         misled = selection.accepted[int(np.argmin(data.workers.map(worse, rest)))]
@@ -68,20 +54,13 @@ def without_worse_predictions(
     return selection
 
 
-def with_accepted_effects(vehicle: Vehicle, point: Point, accepted: Sequence[Candidate]) -> Vehicle:
-    """The vehicle with the accepted effects at their values of the model."""
+def with_accepted_effects(vehicle: Vehicle, selection: Selection, accepted: Sequence[Candidate]) -> Vehicle:
+    """The vehicle with the accepted effects at their fitted values."""
     kept = {n: dict(v) for n, v in vehicle.effects.items()}
     for candidate in accepted:
-        found = point.effects.get(candidate.effect, {})
+        found = selection.final.effects.get(candidate.effect, {})
         kept[candidate.effect] = {k: v for k, v in found.items() if v is not None}
     return replace(vehicle, effects=kept)
-
-
-def _on_its_day(vehicle: Vehicle, flight: Data, point: Point, accepted: Sequence[Candidate]) -> Vehicle:
-    """The vehicle with the trim and the thrust of the day of one flight, as fitted under a model."""
-    there = held_out_fit(flight.twin(), point, accepted).point.effects
-    today = {name: dict(there[name]) for name in (TRIM, THRUST.effect) if name in there}
-    return replace(vehicle, effects={**vehicle.effects, **today})
 
 
 def ratio(before: Sequence[HorizonErrors | None], after: Sequence[HorizonErrors | None]) -> float:
