@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis.fitting.model import Model, Point
+from crazyem.diagnosis.fitting.model import Model, Point, filter_corrections
 from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.situation import (
     causal_middle,
@@ -60,24 +60,43 @@ def test_what_measurements_brought(seed):
     np.testing.assert_allclose(found, np.where(starts[:, None], 0.0, expected), atol=1e-13)
 
 
-def test_after_a_restart_nothing_counts_before_it_is_measured():
-    """A log of mixed rates with restarts, against a loop over rows: unmeasured states are those of the measurements
-    before and after, and the first measurement after a restart says nothing of the model."""
-    flight = flight_of(fly(seconds=5.0), DRONE)
-    rng, y = np.random.default_rng(1), flight.y.copy()
+def restarting(seed: int = 1):
+    """A flight, and the same as a log of mixed rates in which the filter restarts."""
+    whole = flight_of(fly(seconds=5.0), DRONE)
+    rng, y = np.random.default_rng(seed), whole.y.copy()
     for columns in (slice(0, 6), slice(6, 10)):
         y[rng.random(len(y)) < 0.7, columns] = np.nan
-    flight = replace(flight, y=y, starts=flight.starts | (rng.random(len(y)) < 0.05))
+    return whole, replace(whole, y=y, starts=whole.starts | (rng.random(len(y)) < 0.05))
+
+
+def test_states_that_nothing_measured_since_a_restart_are_interpolated():
+    """Against a loop over the rows."""
+    _, flight = restarting()
     found, seen = unmeasured(flight), np.zeros(4, bool)
-    for k in range(len(y)):
-        seen = (seen & (not flight.starts[k])) | np.isfinite(y[k, [0, 3, 6, 10]])
+    for k, row in enumerate(flight.y):
+        seen = (seen & (not flight.starts[k])) | np.isfinite(row[[0, 3, 6, 10]])
         np.testing.assert_array_equal(found[k], ~seen)
-    states = np.full((len(y), 19), 7.0)
-    filled = with_interpolated_states(states, flight)
+    filled, other = with_interpolated_states(flight, np.full((len(found), 19), 7.0), np.full((len(found), 19), 8.0))
     path = initial_path(flight)
-    np.testing.assert_array_equal(filled[:, 0], np.where(found[:, 0], path[:, 0], 7.0))
-    np.testing.assert_array_equal(filled[:, 9], np.where(found[:, 2], path[:, 9], 7.0))
-    assert (filled[:, 13:] == 7.0).all()
+    for states, known in ((filled, 7.0), (other, 8.0)):
+        np.testing.assert_array_equal(states[:, 0], np.where(found[:, 0], path[:, 0], known))
+        np.testing.assert_array_equal(states[:, 9], np.where(found[:, 2], path[:, 9], known))
+        assert (states[:, 13:] == known).all()
+
+
+def test_the_first_measurement_after_a_restart_is_no_force():
+    """It moves the filter from a guess to the drone. Other corrections are those of a flight that has no restart."""
+    whole, flight = restarting()
+    model, point = Model(flight), Point(DRONE, {}, start_noise())
+    impulse, _, known = filter_corrections(model.settle(point), flight)
+    guessed = np.roll(unmeasured(flight).any(axis=1), 1) & ~flight.starts
+    assert guessed.sum() > 20
+    assert not known[guessed].any()
+    assert not impulse[guessed].any()
+    usual, _, _ = filter_corrections(Model(whole).settle(point), whole)
+    assert np.abs(impulse[:, :3]).max() < 5.0 * np.abs(usual[:, :3]).max()
+    assert model.rows_path is not None
+    assert np.abs(model.rows_path[:, :3] - whole.y[:, :3])[flight.starts].max() < 0.05  # m; without it as far as zero
 
 
 def test_what_is_remembered_is_of_the_last_path():

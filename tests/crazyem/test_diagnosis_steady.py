@@ -176,19 +176,24 @@ def test_a_trim_that_is_asked_for_is_fitted_and_taken_before_a_better_weak_rotor
 
 
 def test_a_trial_whose_scores_scatter_does_not_end_the_search(monkeypatch) -> None:
-    """By the common dispersion a tilt of 110 nats is before a lag of 90; by its own of 60, it explains nothing."""
-    fitted: Any = object()
-    tilt = Trial(Candidate("attitude_misalignment", (), ("roll",)), 110.0, 0.0, 60.0, 0.8, fitted, admissible=True)
-    lag = Trial(Candidate("motor_lag", (), ("time_constant",)), 90.0, 0.0, 2.0, 44.0, fitted, admissible=True)
-    monkeypatch.setattr(selecting, "fitted_trial", lambda basis, entry, solution, *, say: entry)
-    monkeypatch.setattr(selecting, "compared_with_refitted_noise", lambda basis, trials, *, say: (trials, trials[:1]))
+    """Fitted, a tilt has scores that scatter 60 times too much. By the common dispersion of 31 the tilt of 110 nats is
+    before a lag of 90; by its own dispersion, it explains nothing."""
+    tilt = Trial(Candidate("attitude_misalignment", (), ("roll",)), 110.0, 0.0, 20.0, 4.5, admissible=True)
+    lag = Trial(Candidate("motor_lag", (), ("time_constant",)), 90.0, 0.0, 2.0, 44.0, admissible=True)
+
+    def fitted_trial(basis, trial, solution, *, say):
+        return replace(trial, fitted=object(), dispersion=60.0 if trial is tilt else 2.0)
+
+    monkeypatch.setattr(selecting, "fitted_trial", fitted_trial)
     data: Any = SimpleNamespace(workers=Workers(1))
     basis = Basis(data, None, point_of(DRONE), (), 0.0, 0.0)
-    entries: Any = [(tilt, None), (lag, None)]
-    taken = step_of(basis, entries, say=lambda text: None).taken
-    assert taken is not None
-    assert taken.candidate is lag.candidate
-    assert step_of(basis, entries[:1], say=lambda text: None).taken is None
+    entries: Any = [(lag, None), (tilt, None)]
+    assert {t.candidate.effect for t, _ in shortlist(entries)} == {"attitude_misalignment", "motor_lag"}
+    found = step_of(basis, entries, say=lambda text: None)
+    assert found.taken is not None
+    assert found.taken.candidate is lag.candidate
+    assert [t.candidate for t in found.trials] == [lag.candidate, tilt.candidate]
+    assert step_of(basis, entries[1:], say=lambda text: None).taken is None
 
 
 def test_beside_a_trim_neither_a_weak_rotor_nor_the_place_of_a_load_is_asked_for() -> None:

@@ -71,7 +71,8 @@ def filter_corrections(swept: Swept, flight: Flight) -> tuple[NDArray, NDArray, 
     """Corrections of a pass of the filter to its model by steps: changes (n, 6) of velocity [m/s] and body rate
     [rad/s], body axes; lengths (n,) of the steps [s]; whether they are known (n,). Unknown ones are 0.
 
-    The first measurement after a start corrects a guess, which says nothing of the model."""
+    The first measurement after a start corrects a guess, which says nothing of the model.
+    """
     step = np.diff(flight.time, prepend=flight.time[0])
     known = (step > 0) & ~flight.starts & ~np.roll(unmeasured(flight).any(axis=1), 1)
     impulse = np.zeros((step.size, 6))
@@ -248,7 +249,7 @@ class Model:
         if not np.isfinite(swept.filtered).all():  # the next model must not start from such states
             self.path = self.rows_path = self.observed_acceleration = self.observed_force = None
             return swept
-        filtered, predicted = (with_interpolated_states(v, flight) for v in (swept.filtered, swept.predicted))
+        filtered, predicted = with_interpolated_states(flight, swept.filtered, swept.predicted)
         self.path = causal_middle(filtered, predicted, flight.starts)
         self.rows_path = under_relaxed(filtered, self.rows_path, offset)
         found = filter_corrections(swept, flight)

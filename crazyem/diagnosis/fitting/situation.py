@@ -44,14 +44,13 @@ def unmeasured(flight: Flight) -> NDArray:
     return found
 
 
-def with_interpolated_states(states: NDArray, flight: Flight) -> NDArray:
-    """States (n, 19) of the filter, with measurements from before and after where none since its start is known."""
+def with_interpolated_states(flight: Flight, *states: NDArray) -> list[NDArray]:
+    """States (n, 19) of the filter; one without a measurement since its start is interpolated between measurements."""
     missing = np.repeat(unmeasured(flight), [c.stop - c.start for c in COLUMNS.values()], axis=1)
     if not missing.any():
-        return states
-    filled = states.copy()
-    filled[:, :13] = np.where(missing, initial_path(flight)[:, :13], states[:, :13])
-    return filled
+        return list(states)
+    path = initial_path(flight)[:, :13]
+    return [np.hstack([np.where(missing, path, s[:, :13]), s[:, 13:]]) for s in states]
 
 
 def thrust_of(flight: Flight, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, NDArray]:

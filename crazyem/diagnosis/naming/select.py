@@ -43,7 +43,7 @@ from crazyem.diagnosis.naming.trials import (
     by_evidence,
     dispersion_of,
     distinguishable,
-    separate_evidence,
+    is_explanation,
 )
 from crazyem.diagnosis.settings import SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -236,11 +236,11 @@ def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Call
     fitted = basis.data.workers.map(lambda entry: fitted_trial(basis, *entry, say=say), shortlist(linear))
     trials = by_evidence([t for t in fitted if t.fitted is not None], counted=counted)
     rest = [t for t, _ in linear if all(t.candidate is not p.candidate for p in trials)]
-    if trim := next((t for t in trials if t.candidate.effect == TRIM and rivals(t, counted=counted)), None):
-        return Step((*trials, *rest), trim, steady_rivals(trim, [t for t in trials if rivals(t, counted=counted)]))
-    # at the common dispersion, a trial may be the first whose own scores scatter so much that it explains nothing
-    trials = sorted(trials, key=lambda t: not rivals(t, counted=counted))
-    if not trials or not rivals(trials[0], counted=counted):
+    if trim := next((t for t in trials if t.candidate.effect == TRIM and is_explanation(t, counted=counted)), None):
+        return Step(
+            (*trials, *rest), trim, steady_rivals(trim, [t for t in trials if is_explanation(t, counted=counted)])
+        )
+    if not trials or not is_explanation(trials[0], counted=counted):
         return Step((*trials, *rest), None)
     trials, equals = compared_with_refitted_noise(basis, trials, say=say)
     return Step((*trials, *rest), equals[0], tuple(t for t in equals[1:] if not _same_effect(t, equals[0])))
@@ -312,7 +312,9 @@ def hid_another(steps: Sequence[Step], gone: set[str], *, counted: bool) -> bool
     taken = [s for s in steps if s.taken]
     first = next((i for i, s in enumerate(taken) if s.taken and s.taken.candidate.effect in gone), len(taken))
     after = [s.taken.candidate.effect for s in taken[first:] if s.taken]
-    others = [t.candidate.effect for s in taken[first : first + 1] for t in s.trials if rivals(t, counted=counted)]
+    others = [
+        t.candidate.effect for s in taken[first : first + 1] for t in s.trials if is_explanation(t, counted=counted)
+    ]
     return any(name not in gone for name in (*after, *others))
 
 
@@ -370,7 +372,7 @@ def compared_with_refitted_noise(
     nearly = [
         t
         for t in trials
-        if rivals(t, counted=counted)
+        if is_explanation(t, counted=counted)
         and (t.value > SELECTION.noise_share * trials[0].value or (turns and CATALOGUE[t.candidate.effect].twins))
     ]
     equals += [t for t in nearly[: SELECTION.max_compared] if all(t is not e for e in equals)]
@@ -381,7 +383,7 @@ def compared_with_refitted_noise(
     rest = [t for t in trials if all(t is not e for e in equals)]
     trials = by_evidence([*again, *rest], counted=counted)
     close = [t for t in trials if any(t.candidate is a.candidate for a in again)]
-    explain = [t for t in close if t is close[0] or rivals(t, counted=counted)]
+    explain = [t for t in close if t is close[0] or is_explanation(t, counted=counted)]
     # by the evidence on all flights: slow flights do not determine a drag
     best = max(explain, key=lambda t: t.worth)
     return trials, alike_with(best, close, counted=counted)
@@ -389,14 +391,9 @@ def compared_with_refitted_noise(
 
 def alike_with(best: Trial, trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
     """The best trial and its look-alikes."""
-    others = [t for t in trials if t is not best and rivals(t, counted=counted)]
+    others = [t for t in trials if t is not best and is_explanation(t, counted=counted)]
     return [best, *(t for t in others if not distinguishable(best, t))]
 
 
 def _same_effect(one: Trial, other: Trial) -> bool:
     return one.candidate.effect == other.candidate.effect
-
-
-def rivals(trial: Trial, *, counted: bool) -> bool:
-    """Whether a candidate is an explanation: it exceeds its detection limit and has enough evidence on all flights."""
-    return trial.admissible and separate_evidence(trial, counted=counted) > SELECTION.min_evidence

@@ -187,7 +187,7 @@ def distinguishable(best: Trial, other: Trial) -> bool:
 
 def by_evidence(trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
     """The trials with the evidence at their common (median) dispersion, best first: so likelihoods are compared, and
-    not dispersions."""
+    not dispersions. Explanations come before trials whose own scores scatter too much for one."""
     if not trials:
         return []
     common = float(np.median([t.dispersion for t in trials]))
@@ -195,7 +195,7 @@ def by_evidence(trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
         replace(t, evidence=(t.gain + (t.held_out if counted else 0.0)) / common - len(t.candidate.free))
         for t in trials
     ]
-    return sorted(judged, key=lambda t: (not t.admissible, -t.evidence))
+    return sorted(judged, key=lambda t: (not is_explanation(t, counted=counted), not t.admissible, -t.evidence))
 
 
 def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
@@ -208,9 +208,10 @@ def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
     return frozenset(t.candidate.effect for t in fitted if 0 < SELECTION.kept_share * t.gain < left[t.candidate.effect])
 
 
-def separate_evidence(trial: Trial, *, counted: bool) -> float:
-    """Evidence at the candidate's own dispersion, by which it is admitted."""
-    return (trial.gain + (trial.held_out if counted else 0.0)) / trial.dispersion - len(trial.candidate.free)
+def is_explanation(trial: Trial, *, counted: bool) -> bool:
+    """Whether a trial exceeds its detection limit and has enough evidence, at its own dispersion, on all flights."""
+    nats = (trial.gain + (trial.held_out if counted else 0.0)) / trial.dispersion - len(trial.candidate.free)
+    return trial.admissible and nats > SELECTION.min_evidence
 
 
 def dispersion_of(fitted: Fitted, count: int, *, offset: int) -> float:
