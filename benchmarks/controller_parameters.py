@@ -21,17 +21,18 @@ from typing import Any
 import numpy as np
 
 from benchmarks.indi_flight import GuardedFlight, scaled
-from crazyem.control.command_units import effectiveness_torque, lag_share
+from crazyem.control.command_units import IndiGains, effectiveness_torque, lag_share
 from crazyem.control.trajectories import Reference, Trajectory, excite, figure8, hover
-from crazyem.vehicle import Vehicle, load_vehicle
+from crazyem.vehicle import GRAVITY, Vehicle, load_vehicle
 from firmware_sim.plant import layout as at
 from firmware_sim.scenario import Scenario, parse_scenario
 
 MELLINGER, INDI, LEE = 2, 3, 5  # stabilizer.controller
 AXES = "pqr"
 EXCITED, REST, STEP, AFTER = 4.0, 1.0, 0.5, 2.0  # s, s, m, s: excitation, hover, step of the place, hover
-LATERAL, ANGULAR, RAMP = 0.9, 9.0, 0.5  # m/s^2, rad/s^2, s of the excitation
-TILT_LIMIT = math.radians(10.0)  # posCtrlIndi.pq_clamping: reached by a step of the position
+LATERAL, ANGULAR, RAMP = 1.4, 8.0, 0.25  # m/s^2, rad/s^2, s of the excitation
+TILT_LIMIT = 25.0  # deg, posCtrlIndi.pq_clamping of these flights; 10 at boot
+STEP_TILT = math.atan(IndiGains().place[0] * IndiGains().velocity[0] * STEP / GRAVITY)  # rad, wanted at the step
 WITHIN = 0.05  # of the true g1
 SPEED = 1.5  # m/s, the highest of the figure
 MARKS = ("<!-- controllers: table -->", "<!-- /controllers -->")
@@ -106,10 +107,10 @@ def pitch(row: Sequence[float]) -> float:
 
 
 def overshoot(flight: GuardedFlight) -> float:
-    """Overshoot of the pitch after a step of the position, relative: 0.1 is 11 degrees; NaN after a crash."""
+    """Overshoot of the pitch after a step of the position, relative to the wanted one; NaN after a crash."""
     begun = EXCITED + REST
     seen = [pitch(row) for row in flight.rows if begun <= row[0] <= begun + 0.6]
-    return max(seen) / TILT_LIMIT - 1.0 if seen and not flight.crashed else math.nan
+    return max(seen) / STEP_TILT - 1.0 if seen and not flight.crashed else math.nan
 
 
 def indi(
@@ -119,7 +120,7 @@ def indi(
     world, vehicle = draw(seed), load_vehicle("cf2")
     scenario = parse_scenario(world.table(), f"seed {seed}")
     true = true_effectiveness(scenario, vehicle)
-    told = {f"ctrlINDI.g1_{a}": start * g for a, g in zip(AXES, true)}
+    told = {f"ctrlINDI.g1_{a}": start * g for a, g in zip(AXES, true)} | {"posCtrlIndi.pq_clamping": TILT_LIMIT}
     if not push:
         told |= {f"ctrlINDI.act_dyn_{a}": lag_share(world.lag) for a in AXES}
     tamper = None if inertia_factor is None else lambda e: scaled(e, ("Ixx", "Iyy", "Izz"), inertia_factor)

@@ -51,15 +51,14 @@ class Controller:
 
     @property
     def waits(self) -> Mapping[str, tuple[str, ...]]:
-        """Estimate -> other estimates that are written together with it, because they share a gain.
+        """Estimate -> other estimates that are written with it or before it.
 
-        Attitude gains of roll and pitch have one scale. INDI's loop gain depends on roll and pitch inertia, and a lag
-        that is estimated with a wrong inertia is wrong, too.
+        Attitude gains of roll and pitch have one scale. INDI has a loop gain for each axis, but a lag that is estimated
+        with a wrong inertia is wrong, too.
         """
-        if not (self.attitude_gains or self.incremental):
-            return {}
-        both = {"Ixx": ("Iyy",), "Iyy": ("Ixx",)}
-        return both | {"motor_time_constant": ("Ixx", "Iyy")} if self.incremental else both
+        if self.incremental:
+            return {"motor_time_constant": ("Ixx", "Iyy")}
+        return {"Ixx": ("Iyy",), "Iyy": ("Ixx",)} if self.attitude_gains else {}
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -245,8 +245,8 @@ class Guard:
         """The changes without those that wait for other estimates (`Controller.waits`); these get a reason."""
         for name, others in self.controller.waits.items():
             late = [o for o in others if o not in changed and reasons.get(o) != "unchanged"]
-            if not self.controller.attitude_gains:  # one g1 per axis: a refuted or sole one does not wait
-                late = [] if self._refuted(name) else [o for o in late if o in self.limits.parameters]
+            if not self.controller.attitude_gains:  # the axes share no gain: none waits for one that is never written
+                late = [o for o in late if o in self.limits.parameters]
             if name in changed and late:
                 reasons[name] = f"waits for {late[0]}"
         return {name: value for name, value in changed.items() if not reasons[name]}
