@@ -30,7 +30,7 @@ from firmware_sim.scenario import Scenario, parse_scenario
 MELLINGER, INDI, LEE = 2, 3, 5  # stabilizer.controller
 AXES = "pqr"
 EXCITED, REST, STEP, AFTER = 4.0, 1.0, 0.5, 2.0  # s, s, m, s: excitation, hover, step of the place, hover
-LATERAL, ANGULAR, RAMP = 1.4, 8.0, 0.25  # m/s^2, rad/s^2, s of the excitation
+LATERAL, ANGULAR, RAMP = 1.5, 7.0, 0.25  # m/s^2, rad/s^2, s of the excitation
 TILT_LIMIT = 25.0  # deg, posCtrlIndi.pq_clamping of these flights; 10 at boot
 STEP_TILT = math.atan(IndiGains().place[0] * IndiGains().velocity[0] * STEP / GRAVITY)  # rad, wanted at the step
 WITHIN = 0.05  # of the true g1
@@ -89,7 +89,7 @@ def true_effectiveness(scenario: Scenario, vehicle: Vehicle) -> tuple[float, ...
 def excite_and_step() -> Trajectory:
     """Excitation, hover, then a step of the position by half a metre along x."""
     shaken = excite(
-        position=(0.0, 0.0, 1.0), duration=EXCITED, lateral=LATERAL, vertical=0.5, angular=ANGULAR, ramp=RAMP
+        position=(0.0, 0.0, 1.0), duration=EXCITED, lateral=LATERAL, vertical=0.0, angular=ANGULAR, ramp=RAMP
     )
 
     def at_time(t: float) -> Reference:

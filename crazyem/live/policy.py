@@ -41,7 +41,6 @@ class MonitorLimits:
 
     Attributes:
         lead: s by which the setpoint may be ahead of the drone; this lead is no error.
-        place_lead: s; the setpoints of INDI are ahead of the drone by this time multiplied by its velocity.
         high_pass: s, time constant of the high-pass on body rates: 1.6 Hz, above the frequencies of trajectories.
         before, settle, after: s, lengths of the stretches.
         unjudged: largest number of sets of writes before a verdict.
@@ -54,8 +53,7 @@ class MonitorLimits:
     """
 
     enabled: bool = True
-    lead: float = 0.1  # not a key of a policy, like the next two: they belong to the controller
-    place_lead: float = 0.0
+    lead: float = 0.1  # not a key of a policy, like the next one
     high_pass: float = 0.1
     before: float = 2.0
     settle: float = 0.5

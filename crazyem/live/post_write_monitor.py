@@ -9,6 +9,7 @@ import threading
 from collections import deque
 from dataclasses import dataclass, replace
 
+from crazyem.control.indi_response import IndiResponse
 from crazyem.live.policy import MonitorLimits
 from crazyem.live.telemetry import tilt_of
 from crazyem.signals.sample import Sample
@@ -74,10 +75,16 @@ class PostWriteMonitor:
 
     Several writes in short succession are judged together, against the stretch before the first. Samples, innovations
     and writes may come from three threads.
+
+    Args:
+        response: where a controller takes the drone that follows positions ahead of the drone (INDI). The distance is
+            then that from the expected position, not from the setpoint, and horizontal: what is written to INDI
+            changes torques, not thrust.
     """
 
-    def __init__(self, limits: MonitorLimits | None = None) -> None:
+    def __init__(self, limits: MonitorLimits | None = None, response: IndiResponse | None = None) -> None:
         self.limits = limits or MonitorLimits()
+        self.response = response
         self._lock = threading.RLock()
         self._tracking, self._speed = _Series(), _Series()
         self._innovation, self._oscillation = _Series(), _Series()
@@ -145,12 +152,13 @@ class PostWriteMonitor:
 
     def _position(self, time: float, position: tuple[float, ...]) -> None:
         if self._setpoints and abs(time - self._setpoints[-1][0]) <= SPEED_SPAN:
-            ahead = self.limits.place_lead
-            there = tuple(p + ahead * v for p, v in zip(position, self._velocity))
-            square = math.dist(there, self._setpoints[-1][1]) ** 2
-            self._raw.add(time, square)
+            wanted = self._setpoints[-1][1]
+            if self.response is not None:
+                wanted = self.response.expected(time, wanted, position, self._velocity)
+            self._raw.add(time, math.dist(position, wanted) ** 2)
             if not self._is_excused(time):
-                self._tracking.add(time, square)
+                axes = 3 if self.response is None else 2
+                self._tracking.add(time, math.dist(position[:axes], wanted[:axes]) ** 2)
 
     def _body_rate(self, time: float, rate: tuple[float, ...]) -> None:
         before, self._rate = self._rate, (time, rate)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from crazyem.control.indi_response import IndiResponse
 from crazyem.estimation.drag import DragRegression
 from crazyem.estimation.result import Estimate, Step
 from crazyem.live.controllers import EQUAL_WITHIN, writes_back
@@ -23,9 +24,6 @@ from crazyem.live.push import Pusher
 from crazyem.live.write_gate import WriteGate
 from crazyem.signals.sample import Sample
 
-# s. INDI commands a speed (position error times posCtrlIndi.K_xi) and an acceleration (speed error times K_dxi). So it
-# follows positions that are ahead of the drone.
-INDI_PLACE_LEAD, INDI_LEAD = 1.0, 0.4
 # s, 6 Hz: with too high a loop gain INDI oscillates with 7 to 12 Hz; an excitation has 1 to 4 Hz.
 INDI_HIGH_PASS = 0.027
 MONITOR_PERIOD = 0.04  # s between judgements
@@ -92,14 +90,8 @@ class WriteSupervisor:
         self.gate = gate
         limits = rules.policy.watch
         if guard.controller.incremental:
-            limits = replace(
-                limits,
-                oscillation=limits.incremental_oscillation,
-                lead=INDI_LEAD,
-                place_lead=INDI_PLACE_LEAD,
-                high_pass=INDI_HIGH_PASS,
-            )
-        self.watch = PostWriteMonitor(limits)
+            limits = replace(limits, oscillation=limits.incremental_oscillation, high_pass=INDI_HIGH_PASS)
+        self.watch = PostWriteMonitor(limits, IndiResponse() if guard.controller.incremental else None)
         self.drag = DragRegression()
         guard.capped = rules.policy.watch.enabled and not rules.dry_run
         self.pusher: Pusher | None = None

@@ -79,22 +79,34 @@ def test_effectiveness_arrives_in_a_second_and_a_half(scale) -> None:
 
 
 @pytest.mark.parametrize("scale", [0.5, 0.9])
-def test_roll_and_pitch_are_written_together_and_the_lag_with_them(scale: float) -> None:
-    """Sets that are not yet judged are few: one set holds what belongs together. What is refuted waits for nothing."""
+def test_an_axis_waits_for_no_other_and_the_lag_for_roll_and_pitch(scale: float) -> None:
     wrong = {f"ctrlINDI.g1_{a}": scale * t / TRUTH[n] for a, t, n in zip("pqr", effectiveness_torque(CF2), NAMES)}
 
     def late(t: float) -> Estimate:
         return Estimate(t, {**estimate(t).parameters, "Iyy": estimate(t, relative_sd=0.003 if t > 2.0 else 0.2)["Iyy"]})
 
     first, *others = decided(guard_of(bound_to(INDI), **wrong), 4.0, make=late)
-    assert {n for n, _ in first.writes} == {"ctrlINDI.g1_r"} | ({"ctrlINDI.g1_p"} if scale < 0.7 else set())
-    rest = {n for n, _ in others[0].writes}
+    assert {n for n, _ in first.writes} == {"ctrlINDI.g1_p", "ctrlINDI.g1_r"}
     assert others[0].time > 2.0
-    assert {f"ctrlINDI.{n}" for n in ("g1_q", "act_dyn_p", "act_dyn_q", "act_dyn_r")} <= rest
-    assert ("ctrlINDI.g1_p" in rest) == (scale > 0.7)
+    assert {f"ctrlINDI.{n}" for n in ("g1_q", "act_dyn_p", "act_dyn_q", "act_dyn_r")} <= {n for n, _ in others[0].writes}
     alone = guard_of(bound_to(INDI), **wrong)
     alone.limits = replace(alone.limits, parameters=("Ixx",))  # a policy that writes nothing else
     assert {n for d in decided(alone, 4.0, make=late) for n, _ in d.writes} == {"ctrlINDI.g1_p"}
+
+
+def test_pitch_is_corrected_while_roll_waits_at_its_cap_for_a_verdict() -> None:
+    """The belief about roll is half of the truth: the cap without a verdict is 1.5 times the belief."""
+    torque = dict(zip(NAMES, effectiveness_torque(CF2)))
+    believed = {"Ixx": 0.5 * TRUTH["Ixx"], "Iyy": 0.9 * TRUTH["Iyy"]}
+    g1 = {"ctrlINDI.g1_p": torque["Ixx"] / believed["Ixx"], "ctrlINDI.g1_q": torque["Iyy"] / believed["Iyy"]}
+
+    def moves(t: float) -> Estimate:
+        return estimate(t, Iyy=TRUTH["Iyy"] * (1.0 if t > 1.5 else 0.97))
+
+    decisions = decided(guard_of(bound_to(INDI), **g1), 4.0, make=moves, judged=False)
+    held = {name: value for d in decisions for name, value in d.writes}
+    assert held["ctrlINDI.g1_p"] == pytest.approx(torque["Ixx"] / (1.5 * believed["Ixx"]), rel=1e-6)
+    assert held["ctrlINDI.g1_q"] == pytest.approx(torque["Iyy"] / TRUTH["Iyy"], rel=0.01)
 
 
 def test_a_wrong_inertia_moves_g1_no_further_than_its_bounds() -> None:
