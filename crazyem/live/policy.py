@@ -40,7 +40,7 @@ class MonitorLimits:
     """Limits for the comparison of the flight after a write with the flight before it.
 
     Attributes:
-        lead: s by which the setpoint may be ahead of the drone; this lead is no error.
+        lead: s by which the setpoint may be ahead of the drone; this lead is no error. 0 with an expected response.
         high_pass: s, time constant of the high-pass on body rates: 1.6 Hz, above the frequencies of trajectories.
         before, settle, after: s, lengths of the stretches.
         unjudged: largest number of sets of writes before a verdict.

@@ -90,7 +90,7 @@ class WriteSupervisor:
         self.gate = gate
         limits = rules.policy.watch
         if guard.controller.incremental:
-            limits = replace(limits, oscillation=limits.incremental_oscillation, high_pass=INDI_HIGH_PASS)
+            limits = replace(limits, oscillation=limits.incremental_oscillation, lead=0.0, high_pass=INDI_HIGH_PASS)
         self.watch = PostWriteMonitor(limits, IndiResponse() if guard.controller.incremental else None)
         self.drag = DragRegression()
         guard.capped = rules.policy.watch.enabled and not rules.dry_run

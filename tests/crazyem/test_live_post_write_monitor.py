@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from crazyem.control.indi_response import IndiResponse
 from crazyem.live.policy import MonitorLimits
 from crazyem.live.post_write_monitor import SERIES_LENGTH, PostWriteMonitor
 from crazyem.signals.sample import Sample
@@ -117,21 +118,21 @@ def test_a_high_pass_of_6_hz_tells_trembling_from_an_excitation():
         assert watch.judge(12.0)[0] == verdict
 
 
-@pytest.mark.parametrize(("slow", "verdict"), [(0.0, "good"), (0.7, "worse")])
-def test_a_place_ahead_by_the_drones_own_speed_is_no_error(slow, verdict):
-    """INDI: 1 m/s along x from WRITE on, places 1 m ahead; a drone that is 0.7 m/s slower than that is worse."""
-    watch = PostWriteMonitor(MonitorLimits(lead=0.1, place_lead=1.0))
+@pytest.mark.parametrize(("aside", "below", "verdict"), [(0.0, 0.0, "good"), (0.0, 0.3, "good"), (0.3, 0.0, "worse")])
+def test_indi_is_compared_with_its_expected_response(aside: float, below: float, verdict: str) -> None:
+    """Places far ahead from WRITE on. The drone responds as it should, or does so aside or below."""
+    response, watch = IndiResponse(), PostWriteMonitor(MonitorLimits(lead=0.0), IndiResponse())
     for n in range(1200):
         t = 0.01 * n
-        gone = max(t - WRITE, 0.0)
-        speed = 1.0 if gone else 0.0
-        watch.take(Sample("velocity", t, (speed * (1.0 - slow), 0.0, 0.0)))
-        watch.take(Sample("setpoint_position", t, (gone + speed, 0.0, 1.0)))
-        watch.take(Sample("position", t, (gone, 0.0, 1.0)))
+        off = 1.0 if t > WRITE else 0.0
+        ahead = 0.5 * off * math.sin(6.0 * (t - WRITE))
+        x, y, z = response.expected(t, (ahead, 0.0, 1.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+        watch.take(Sample("setpoint_position", t, (ahead, 0.0, 1.0)))
+        watch.take(Sample("position", t, (x, y + off * aside, z - off * below)))
         watch.take(Sample("body_rate", t, (0.0, 0.0, 0.0)))
         if n == round(100 * WRITE):
             watch.on_write(t, t)
-        elif gone > 2.0 and watch.judge(t)[0]:
+        elif t > WRITE + 2.0 and watch.judge(t)[0]:
             break
     assert watch.judge(t)[0] == verdict
 
