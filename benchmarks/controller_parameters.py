@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,13 +30,25 @@ from firmware_sim.scenario import Scenario, parse_scenario
 MELLINGER, INDI, LEE = 2, 3, 5  # stabilizer.controller
 AXES = "pqr"
 EXCITED, REST, STEP, AFTER = 4.0, 1.0, 0.5, 2.0  # s, s, m, s: excitation, hover, step of the place, hover
-LATERAL, ANGULAR, RAMP = 1.5, 7.0, 0.25  # m/s^2, rad/s^2, s of the excitation
-TILT_LIMIT = 25.0  # deg, posCtrlIndi.pq_clamping of these flights; 10 at boot
 STEP_TILT = math.atan(IndiGains().place[0] * IndiGains().velocity[0] * STEP / GRAVITY)  # rad, wanted at the step
 WITHIN = 0.05  # of the true g1
 SPEED = 1.5  # m/s, the highest of the figure
 MARKS = ("<!-- controllers: table -->", "<!-- /controllers -->")
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "results" / "controller_parameters.md"
+
+
+class Excitation(NamedTuple):
+    """rms accelerations [m/s^2, m/s^2, rad/s^2], ramp [s], and posCtrlIndi.pq_clamping [deg]."""
+
+    lateral: float
+    vertical: float
+    angular: float
+    ramp: float
+    tilt_limit: float
+
+
+STRONG = Excitation(lateral=1.25, vertical=0.0, angular=5.5, ramp=0.25, tilt_limit=25.0)
+USUAL = Excitation(lateral=0.9, vertical=0.5, angular=9.0, ramp=0.5, tilt_limit=10.0)  # twice that of `crazyem fly`
 
 
 @dataclass(frozen=True)
@@ -86,11 +98,12 @@ def true_effectiveness(scenario: Scenario, vehicle: Vehicle) -> tuple[float, ...
     return tuple(t / float(j) for t, j in zip(effectiveness_torque(vehicle), inertia))
 
 
-def excite_and_step() -> Trajectory:
+def excite_and_step(e: Excitation) -> Trajectory:
     """Excitation, hover, then a step of the position by half a metre along x."""
     shaken = excite(
-        position=(0.0, 0.0, 1.0), duration=EXCITED, lateral=LATERAL, vertical=0.0, angular=ANGULAR, ramp=RAMP
-    )
+        position=(0.0, 0.0, 1.0), duration=EXCITED, lateral=e.lateral, vertical=e.vertical, angular=e.angular,
+        ramp=e.ramp,
+    )  # fmt: skip
 
     def at_time(t: float) -> Reference:
         if t < EXCITED:
@@ -117,10 +130,13 @@ def indi(
     seed: int, start: float, *, push: bool = True, inertia_factor: float | None = None, guard: bool = True
 ) -> dict[str, Any]:
     """Result of one flight of INDI whose g1 at take-off is `start` times the true one."""
+    excitation = STRONG if inertia_factor is None else USUAL
     world, vehicle = draw(seed), load_vehicle("cf2")
     scenario = parse_scenario(world.table(), f"seed {seed}")
     true = true_effectiveness(scenario, vehicle)
-    told = {f"ctrlINDI.g1_{a}": start * g for a, g in zip(AXES, true)} | {"posCtrlIndi.pq_clamping": TILT_LIMIT}
+    told = {f"ctrlINDI.g1_{a}": start * g for a, g in zip(AXES, true)} | {
+        "posCtrlIndi.pq_clamping": excitation.tilt_limit
+    }
     if not push:
         told |= {f"ctrlINDI.act_dyn_{a}": lag_share(world.lag) for a in AXES}
     tamper = None if inertia_factor is None else lambda e: scaled(e, ("Ixx", "Iyy", "Izz"), inertia_factor)
@@ -135,7 +151,7 @@ def indi(
                 f.client.set(f"ctrlINDI.g1_{a}", g / inertia_factor)
         errors.append((f.seconds, max(abs(f.read(f"ctrlINDI.g1_{a}") / g - 1.0) for a, g in zip(AXES, true))))
 
-    flight.fly(excite_and_step(), each=look, push_for=EXCITED + 0.9 * REST)
+    flight.fly(excite_and_step(excitation), each=look, push_for=EXCITED + 0.9 * REST)
     far = [t for t, error in errors if error > WITHIN]
     return {
         "crashed": flight.crashed,
