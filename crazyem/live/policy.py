@@ -42,6 +42,7 @@ class MonitorLimits:
     Attributes:
         lead: s by which the setpoint may be ahead of the drone; this lead is no error. 0 with an expected response.
         high_pass: s, time constant of the high-pass on body rates: 1.6 Hz, above the frequencies of trajectories.
+        high_pass_order: how often the rates pass it.
         before, settle, after: s, lengths of the stretches.
         unjudged: largest number of sets of writes before a verdict.
         tracking_ratio, tracking, tracking_alarm: position error, relative to before, and excess over before [m].
@@ -55,6 +56,7 @@ class MonitorLimits:
     enabled: bool = True
     lead: float = 0.1  # not a key of a policy, like the next one
     high_pass: float = 0.1
+    high_pass_order: int = 1
     before: float = 2.0
     settle: float = 0.5
     after: float = 2.5

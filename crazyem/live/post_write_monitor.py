@@ -91,7 +91,7 @@ class PostWriteMonitor:
         self._setpoints: deque[tuple[float, tuple[float, ...]]] = deque(maxlen=64)
         self._velocity: tuple[float, ...] = (0.0, 0.0, 0.0)
         self._rate: tuple[float, tuple[float, ...]] | None = None
-        self._slow: tuple[float, ...] = (0.0, 0.0, 0.0)
+        self._slow: list[tuple[float, ...]] = []  # low-passed input of each stage of the high-pass
         self._tilt = 0.0
         self._raw = _Series()  # distance from the setpoint, also during changes of mass
         self._excused = (math.inf, -math.inf)  # start and end of the time in which a change of mass explains errors
@@ -163,11 +163,14 @@ class PostWriteMonitor:
     def _body_rate(self, time: float, rate: tuple[float, ...]) -> None:
         before, self._rate = self._rate, (time, rate)
         if before is None or not 0.0 < time - before[0] < HIGH_PASS_GAP:
-            self._slow = rate
+            self._slow = [rate] + [(0.0, 0.0, 0.0)] * (self.limits.high_pass_order - 1)
             return
         share = 1.0 - math.exp(-(time - before[0]) / self.limits.high_pass)
-        self._slow = tuple(s + share * (r - s) for s, r in zip(self._slow, rate))
-        self._oscillation.add(time, math.dist(rate, self._slow) ** 2)
+        fast = rate
+        for stage, slow in enumerate(self._slow):
+            self._slow[stage] = tuple(s + share * (f - s) for s, f in zip(slow, fast))
+            fast = tuple(f - s for s, f in zip(self._slow[stage], fast))
+        self._oscillation.add(time, math.hypot(*fast) ** 2)
 
     def figures(self, start: float, end: float, fewest: int = FEWEST_VALUES) -> Figures:
         """The figures between two times [s]."""

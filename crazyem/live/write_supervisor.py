@@ -24,8 +24,8 @@ from crazyem.live.push import Pusher
 from crazyem.live.write_gate import WriteGate
 from crazyem.signals.sample import Sample
 
-# s, 6 Hz: with too high a loop gain INDI oscillates with 7 to 12 Hz; an excitation has 1 to 4 Hz.
-INDI_HIGH_PASS = 0.027
+# s, 4 Hz, second order: with too high a loop gain INDI oscillates with 7 to 12 Hz; an excitation has 1 to 4 Hz.
+INDI_HIGH_PASS, INDI_HIGH_PASS_ORDER = 0.04, 2
 MONITOR_PERIOD = 0.04  # s between judgements
 GROUNDED_WITHIN = 3.0  # s, longest wait for the ground: the firmware reports a flight for 2 s after the motors stop
 HOLD_NOTE_PERIOD = 1.0  # s, shortest time between two notes about the reason why nothing is written
@@ -90,7 +90,13 @@ class WriteSupervisor:
         self.gate = gate
         limits = rules.policy.watch
         if guard.controller.incremental:
-            limits = replace(limits, oscillation=limits.incremental_oscillation, lead=0.0, high_pass=INDI_HIGH_PASS)
+            limits = replace(
+                limits,
+                oscillation=limits.incremental_oscillation,
+                lead=0.0,
+                high_pass=INDI_HIGH_PASS,
+                high_pass_order=INDI_HIGH_PASS_ORDER,
+            )
         self.watch = PostWriteMonitor(limits, IndiResponse() if guard.controller.incremental else None)
         self.drag = DragRegression()
         guard.capped = rules.policy.watch.enabled and not rules.dry_run

@@ -104,14 +104,14 @@ def test_a_setpoint_that_begins_to_move_explains_no_more_than_some_lag():
     assert fly(written(), WRITE, 10.0, wanted=circle, error=0.5)[0] == "worse"
 
 
-def test_a_high_pass_of_6_hz_tells_trembling_from_an_excitation():
-    """2 Hz and 9 Hz of 1.2 rad/s each: with the limits for INDI only the second is worse."""
-    limits = MonitorLimits(oscillation=0.5, high_pass=0.027, oscillation_ratio=1.0)
-    for hertz, verdict in ((2.0, "good"), (9.0, "worse")):
+def test_a_high_pass_of_4_hz_tells_trembling_from_an_excitation():
+    """With the limits for INDI trembling is worse, and an excitation is not."""
+    limits = MonitorLimits(oscillation=0.5, high_pass=0.04, high_pass_order=2, oscillation_ratio=1.0)
+    for hertz, size, verdict in ((2.0, 1.2, "good"), (3.0, 1.8, "good"), (9.0, 1.2, "worse")):
         watch = PostWriteMonitor(limits)
         for n in range(1200):
             t = 0.01 * n
-            rate = 1.2 * math.sin(2 * math.pi * hertz * t) if t > WRITE else 0.0
+            rate = size * math.sin(2 * math.pi * hertz * t) if t > WRITE else 0.0
             watch.take(Sample("body_rate", t, (rate, 0.0, 0.0)))
             if n == round(100 * WRITE):
                 watch.on_write(t, t)
