@@ -15,6 +15,7 @@ from crazyem.vehicle import Vehicle
 IDENTIFIABLE = 0.15  # largest standard deviation of a logarithm that counts as identified
 IMPLAUSIBLE_SD = 3.0  # prior standard deviations from the centre, beyond which an inertia is implausible
 FEWEST_SAMPLES = 20  # samples in flight before anything counts as identified
+NOT_CONVERGED = "not converged yet"  # reason of an estimate whose passes have not reached the maximum
 _INERTIA = (np.arange(len(NAMES)) > 0) & (np.arange(len(NAMES)) < LAG)
 _LOGARITHMIC = np.arange(len(NAMES)) < DELAY
 
@@ -108,7 +109,7 @@ def _objection(
             )
         what = ("thrust", "torque about x", "torque about y", "torque about z", "commands")[i]
         return f"too little excitation: {what} determines it only within {196 * sd:.0f} % (95 %)"
-    return "" if converged else "not converged yet"
+    return "" if converged else NOT_CONVERGED
 
 
 def nothing_known(vehicle: Vehicle, *, reason: str, time: float, updates: int) -> Estimate:

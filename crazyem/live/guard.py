@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from crazyem.estimation.result import Estimate, ParameterEstimate, Step
+from crazyem.estimation.verdict import NOT_CONVERGED
 from crazyem.live.beliefs import DRAG_NAMES, INERTIA_NAMES
 from crazyem.live.controllers import Controller, writes_for
 
@@ -306,8 +307,9 @@ class Guard:
             return "too early to tell"
         # begin with one entry older than the span, so that the span is covered
         first = max((k for k, (t, _, _) in enumerate(self._history) if t <= time - needed), default=0)
-        span = list(self._history)[first:]
-        if any(faults[name] for _, _, faults in span):
+        history = list(self._history)[first:]
+        span = [entry for entry in history if entry[2][name] != NOT_CONVERGED]  # the others neither agree nor disagree
+        if 2 * len(span) < len(history) or any(faults[name] for _, _, faults in span):
             return "only just acceptable"
         values = [v[name] for _, v, _ in span]
         if (max(values) - min(values)) / newest[1][name] > self.limits.of(name, "agreement"):

@@ -12,6 +12,7 @@ from scipy.signal import butter, tf2ss
 
 from crazyem.control.command_units import LOOP, effectiveness_torque, lag_share, rotor_reaction_factor
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
+from crazyem.estimation.verdict import NOT_CONVERGED
 from crazyem.live.beliefs import Slot
 from crazyem.live.controllers import (
     INDI,
@@ -108,6 +109,22 @@ def test_pitch_is_corrected_while_roll_waits_at_its_cap_for_a_verdict() -> None:
     held = {name: value for d in decisions for name, value in d.writes}
     assert held["ctrlINDI.g1_p"] == pytest.approx(torque["Ixx"] / (1.5 * believed["Ixx"]), rel=1e-6)
     assert held["ctrlINDI.g1_q"] == pytest.approx(torque["Iyy"] / TRUTH["Iyy"], rel=0.01)
+
+
+@pytest.mark.parametrize(("converged", "written"), [(7 / 8, True), (1 / 3, False)])
+def test_an_estimate_that_has_not_converged_neither_agrees_nor_disagrees(converged: float, written: bool) -> None:
+    """Written if more than half of the estimates have converged."""
+    counts = iter(range(1000))
+
+    def made(t: float) -> Estimate:
+        found = estimate(t)
+        n = next(counts)
+        if math.floor(converged * (n + 1)) > math.floor(converged * n):
+            return found
+        late = {n: replace(p, identifiable=False, reason=NOT_CONVERGED) for n, p in found.parameters.items()}
+        return Estimate(t, late)
+
+    assert bool(decided(guard_of(bound_to(INDI)), 3.0, make=made)) == written
 
 
 def test_a_wrong_inertia_moves_g1_no_further_than_its_bounds() -> None:

@@ -49,6 +49,7 @@ def test_cflib_connects_logs_and_writes_through_the_relay(resting):
             while not scf.cf.param.get_value("ctrlLee.mass").startswith("0.0313") and time.monotonic() < deadline:
                 time.sleep(0.02)
             assert scf.cf.param.get_value("ctrlLee.mass").startswith("0.0313")
+            scf.cf.link_statistics.stop()  # its ping thread fails if it sends while the link is closed
         for way in ("up", "down"):
             fates = relay.engine.counts.fates[way]
             assert fates["received"] == fates["forwarded"] > 500
@@ -63,6 +64,7 @@ def test_a_bad_air_costs_cflib_log_packets_only(resting):
                down("reorder", rate=0.2, **data), down("delay", jitter_ms=30.0))  # fmt: skip
         assert logs(scf.cf)
         assert scf.cf.is_connected()
+        scf.cf.link_statistics.stop()
 
 
 @pytest.mark.parametrize("k", [0, 5])

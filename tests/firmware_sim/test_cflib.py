@@ -24,10 +24,14 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 @contextlib.contextmanager
 def connected(uri):
-    """A fully connected Crazyflie object."""
+    """A fully connected Crazyflie object.
+
+    cflib's ping thread fails if it sends while the link is closed, so it is stopped before.
+    """
     with SyncCrazyflie(uri, cf=Crazyflie(ro_cache=None, rw_cache=None)) as scf:
         scf.wait_for_params()
         yield scf.cf
+        scf.cf.link_statistics.stop()
 
 
 @contextlib.contextmanager
