@@ -43,13 +43,13 @@ class IndiResponse:
     def expected(
         self, time: float, setpoint: tuple[float, ...], position: tuple[float, ...], velocity: tuple[float, ...]
     ) -> tuple[float, ...]:
-        """Expected position [m, world] at `time` [s], at the measured one after a start or a gap.
+        """Expected position [m, world] at `time` [s]; the measured one after a start, a gap or an invalid setpoint.
 
         Args:
             setpoint: logged last [m, world]; holds from now on. position, velocity: measured [m, m/s, world].
         """
         elapsed = round(1e3 * (time - self._time)) if time - self._time < GAP else -1
-        if elapsed < 0:
+        if elapsed < 0 or not np.isfinite(self._setpoint).all():
             self._state = np.column_stack([position, velocity, np.zeros((3, 2))])
         else:
             F, g = transition(elapsed)

@@ -54,7 +54,7 @@ class MonitorLimits:
     """
 
     enabled: bool = True
-    lead: float = 0.1  # not a key of a policy, like the next one
+    lead: float = 0.1  # not a key of a policy, like the next two: they belong to the controller
     high_pass: float = 0.1
     high_pass_order: int = 1
     before: float = 2.0

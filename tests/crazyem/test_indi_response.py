@@ -36,6 +36,13 @@ def test_the_response_is_the_solution_of_the_loops_equations() -> None:
         state = solve_ivp(slope, (0.0, STEP), state, args=(setpoint(n),), rtol=1e-9, atol=1e-12).y[:, -1]
 
 
+def test_an_invalid_setpoint_costs_one_sample() -> None:
+    response = IndiResponse()
+    response.expected(0.0, (math.nan, 0.0, 1.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+    assert response.expected(STEP, (1.0, 0.0, 1.0), (0.2, 0.0, 1.0), (0.0, 0.0, 0.0)) == (0.2, 0.0, 1.0)
+    assert math.isfinite(response.expected(2 * STEP, (1.0, 0.0, 1.0), (0.3, 0.0, 1.0), (0.0, 0.0, 0.0))[0])
+
+
 def test_after_a_gap_or_a_step_back_in_time_the_response_starts_at_the_drone() -> None:
     response = IndiResponse()
     for time in (1.0, 1.0 + 1.01 * GAP, 0.5):
