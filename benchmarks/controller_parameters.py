@@ -21,7 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.indi_flight import GuardedFlight, scaled
-from crazyem.control.command_units import IndiGains, effectiveness_torque, lag_share
+from crazyem.control.command_units import effectiveness_torque, lag_share
+from crazyem.control.indi import IndiGains
 from crazyem.control.trajectories import Reference, Trajectory, excite, figure8, hover
 from crazyem.vehicle import GRAVITY, Vehicle, load_vehicle
 from firmware_sim.plant import layout as at
@@ -134,13 +135,13 @@ def indi(
     world, vehicle = draw(seed), load_vehicle("cf2")
     scenario = parse_scenario(world.table(), f"seed {seed}")
     true = true_effectiveness(scenario, vehicle)
-    told = {f"ctrlINDI.g1_{a}": start * g for a, g in zip(AXES, true)} | {
+    boot = {f"ctrlINDI.g1_{a}": start * g for a, g in zip(AXES, true)} | {
         "posCtrlIndi.pq_clamping": excitation.tilt_limit
     }
     if not push:
-        told |= {f"ctrlINDI.act_dyn_{a}": lag_share(world.lag) for a in AXES}
+        boot |= {f"ctrlINDI.act_dyn_{a}": lag_share(world.lag) for a in AXES}
     tamper = None if inertia_factor is None else lambda e: scaled(e, ("Ixx", "Iyy", "Izz"), inertia_factor)
-    flight = GuardedFlight(scenario, seed, vehicle, INDI, told, push=push and guard, tamper=tamper)
+    flight = GuardedFlight(scenario, seed, vehicle, INDI, boot, push=push and guard, tamper=tamper)
     errors: list[tuple[float, float]] = []  # s, largest error of the three
     at_once: list[float] = []
 

@@ -12,7 +12,7 @@ from struct import pack
 import numpy as np
 
 from benchmarks.wire_flight import LOG_PERIOD, SETPOINT_JITTER, SETPOINT_PERIOD, Client
-from crazyem.control.command_units import IndiGains, place_ahead
+from crazyem.control.indi import IndiGains, place_ahead
 from crazyem.control.trajectories import Trajectory, after_hover
 from crazyem.estimation.online import ATTITUDE_PERIOD, OnlineEstimator
 from crazyem.estimation.result import Estimate, ParameterEstimate

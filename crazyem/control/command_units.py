@@ -1,21 +1,13 @@
-"""Command units of the firmware's controllers: parameters of INDI and Mellinger, and setpoints for INDI.
+"""Command units of the firmware's controllers: parameters of INDI and Mellinger.
 
 PID, Mellinger and INDI command in units of the firmware's legacy mixer (powerDistributionLegacy in
 power_distribution_quadrotor.c). One unit of thrust or yaw changes every rotor by one unit; one unit of roll or pitch
 changes every rotor by half a unit. 65535 units are the firmware's THRUST_MAX if it compensates the battery voltage
 (motors.c, motorsCompensateBatteryVoltage), else full duty.
-
-INDI uses only position and heading of a position setpoint. Its outer loop (position_controller_indi.c) commands the
-acceleration K_dxi (K_xi (setpoint - p) - v), its inner loop the yaw rate ref_err_r (heading - yaw). A setpoint ahead of
-the reference by (v + a/K_dxi)/K_xi gives the reference's acceleration for a drone on the reference. A heading ahead by
-its rate over ref_err_r does the same for yaw.
 """
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
 
-from crazyem.control.trajectories import Reference
 from crazyem.physics.effects.rotors import TYPICAL_ROTOR_CONSTANT
 from crazyem.vehicle import GRAVITY, Vehicle
 
@@ -132,46 +124,3 @@ def rotor_reaction_factor(vehicle: Vehicle, rotor_inertia: float) -> float:
     per_unit = thrust_per_unit(vehicle, thrust=0.0, volts=0.0)
     thrust = vehicle.mass * GRAVITY / 4.0
     return rotor_reaction(per_unit, thrust=thrust, rotor_constant=constant, rotor_inertia=rotor_inertia, izz=1.0)
-
-
-_AXES = ("x", "y", "z")
-
-
-@dataclass(frozen=True)
-class IndiGains:
-    """INDI's gains in the firmware, 1/s: of position, velocity and heading. Defaults: the values at boot."""
-
-    place: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    velocity: tuple[float, float, float] = (5.0, 5.0, 5.0)
-    heading: float = 5.0
-
-    @classmethod
-    def of(cls, values: Mapping[str, float]) -> "IndiGains":
-        """Gains from parameter values; see `PARAMETERS`. The boot value replaces a gain that is not positive."""
-        plain = cls()
-
-        def positive(name: str, otherwise: float) -> float:
-            return values[name] if values.get(name, 0.0) > 0.0 else otherwise
-
-        place = [positive(f"posCtrlIndi.K_xi_{a}", g) for a, g in zip(_AXES, plain.place)]
-        velocity = [positive(f"posCtrlIndi.K_dxi_{a}", g) for a, g in zip(_AXES, plain.velocity)]
-        return cls(
-            (place[0], place[1], place[2]),
-            (velocity[0], velocity[1], velocity[2]),
-            positive("ctrlINDI.ref_err_r", plain.heading),
-        )
-
-
-PARAMETERS = (
-    *(f"posCtrlIndi.{gain}_{a}" for gain in ("K_xi", "K_dxi") for a in _AXES),
-    "ctrlINDI.ref_err_r",
-)
-
-
-def place_ahead(r: Reference, gains: IndiGains) -> tuple[float, float, float, float]:
-    """Setpoint x, y, z [m, world] and heading [rad] for INDI to follow a reference; see the module."""
-    x, y, z = (
-        p + (v + a / k_v) / k_p
-        for p, v, a, k_p, k_v in zip(r.position, r.velocity, r.acceleration, gains.place, gains.velocity)
-    )
-    return x, y, z, r.yaw + r.yaw_rate / gains.heading

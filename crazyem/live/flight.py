@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from crazyem.control.command_units import PARAMETERS, IndiGains
+from crazyem.control.indi import PARAMETERS, IndiGains
 from crazyem.control.trajectories import Trajectory, Vector, after_hover
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links.base import ConfirmingLink, Link

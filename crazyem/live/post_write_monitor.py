@@ -9,7 +9,7 @@ import threading
 from collections import deque
 from dataclasses import dataclass, replace
 
-from crazyem.control.indi_response import IndiResponse
+from crazyem.control.indi import IndiResponse
 from crazyem.live.policy import MonitorLimits
 from crazyem.live.telemetry import tilt_of
 from crazyem.signals.sample import Sample

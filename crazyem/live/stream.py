@@ -4,7 +4,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from crazyem.control.command_units import IndiGains, place_ahead
+from crazyem.control.indi import IndiGains, place_ahead
 from crazyem.control.trajectories import Reference, Trajectory
 from crazyem.errors import LinkError
 from crazyem.links.base import Link

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from crazyem.control.indi_response import IndiResponse
+from crazyem.control.indi import IndiResponse
 from crazyem.estimation.drag import DragRegression
 from crazyem.estimation.result import Estimate, Step
 from crazyem.live.controllers import EQUAL_WITHIN, writes_back

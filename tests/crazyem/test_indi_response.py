@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from benchmarks.wire_flight import LOG_PERIOD
-from crazyem.control.indi_response import GAP, IndiResponse
+from crazyem.control.indi import GAP, IndiResponse
 
 STEP = 1e-3 * LOG_PERIOD
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crazyem.control.command_units import PARAMETERS, IndiGains, place_ahead
+from crazyem.control.indi import PARAMETERS, IndiGains, place_ahead
 from crazyem.control.trajectories import Reference
 
 vectors = st.tuples(*[st.floats(-3.0, 3.0)] * 3)

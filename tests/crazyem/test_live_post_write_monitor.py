@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from crazyem.control.indi_response import IndiResponse
+from crazyem.control.indi import IndiResponse
 from crazyem.live.policy import MonitorLimits
 from crazyem.live.post_write_monitor import SERIES_LENGTH, PostWriteMonitor
 from crazyem.signals.sample import Sample
