@@ -43,7 +43,7 @@ oldest:  ## an environment of the lower bounds of pyproject.toml, as continuous 
 	touch $(FLIES) $(READY)
 
 fly: $(FLIES)  ## fly the simulated firmware with wrong constants and watch them being corrected
-	$(BIN)/crazyem fly --scenario firmware_sim/scenarios/payload.toml --trajectory excite --duration 20 \
+	$(BIN)/crazyem fly --scenario firmware_sim/scenarios/payload.toml --trajectory excite --duration 12 \
 		--record flight.mcap --json flight.json
 
 test: $(WARM)  ## everything that is not marked slow

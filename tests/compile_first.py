@@ -37,10 +37,11 @@ warm_up(load_vehicle("cf2"))
 
 MADE_FLIGHTS = """
 import sys
-sys.path.insert(0, "tests/crazyem")
-import closed_loop, synthetic
+sys.path[:0] = ["tests/crazyem", "benchmarks"]
+import closed_loop, flight, synthetic
 closed_loop.fly(seconds=1.0)
 synthetic.fly(duration=1.0)
+flight.simulate(seed=1, seconds=1.0)
 """
 
 # Tests that call kernels which nothing above calls: in one process each.

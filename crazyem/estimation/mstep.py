@@ -179,8 +179,8 @@ def maximise(theta, unit, sums, free, centre, precision, known, iterations, squa
                 for u in range(PARAMETERS):
                     theta[u] = trial[u]
                 value = new
-                gradient[:] = g2
-                hessian[:, :] = h2
+                gradient, g2 = g2, gradient
+                hessian, h2 = h2, hessian
                 damping = 0.0 if damping < 1e-3 * sums[COUNT] else 0.1 * damping
                 break
             damping = max(10.0 * damping, 0.05 * sums[COUNT] + 1.0)

@@ -141,7 +141,7 @@ def torque_sensitivities(first, last, time, kind, usable, force, thrust, torque,
         dt = time[k] - time[k - 1]
         h = lead * dt
         apply(blocks[k], dt, h, d, d2)
-        d[:, :] = d2
+        d, d2 = d2, d
         if usable[k]:
             rest = 1.0 if np.isnan(force[k, 2]) else r_force / (q[2] / dt + r_force)
             _push(k, dt, h, xf[k - 1, 10:13], thrust, torque, thrust_tau, torque_tau, thrust_delay, torque_delay, theta,
