@@ -52,8 +52,8 @@ class SetpointStream:
         self._thread = threading.Thread(target=self._run, name="crazyem-setpoints", daemon=True)
 
     def start(self) -> None:
-        """Begin; time 0 of the trajectory is the present time of the firmware's clock."""
-        self.began = self.clock.now()
+        """Begin; time 0 of the trajectory is the stamp of the newest packet."""
+        self.began = self.clock.newest
         self._thread.start()
 
     def stop(self) -> None:
@@ -64,8 +64,11 @@ class SetpointStream:
 
     @property
     def elapsed(self) -> float:
-        """s of firmware time since the start."""
-        return self.clock.now() - self.began
+        """s of firmware time since the start, by the newest packet.
+
+        The predicted clock runs ahead while the simulator or this process does not run; a flight would end early.
+        """
+        return self.clock.newest - self.began
 
     def _run(self) -> None:
         due = time.monotonic()

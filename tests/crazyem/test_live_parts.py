@@ -15,6 +15,7 @@ from crazyem.live.clock import FirmwareClock
 from crazyem.live.history import MOST_ESTIMATES, SETTLE_SECONDS, History, Push, Track
 from crazyem.live.plot import figure_of
 from crazyem.live.simulator import Simulator
+from crazyem.live.stream import SetpointStream
 from crazyem.live.summary import build_summary, check_writable, live_line, text_summary, write_json
 from crazyem.notebook import saved
 from crazyem.signals.sample import Sample
@@ -41,6 +42,17 @@ def test_clock_never_runs_backwards_and_stops_when_the_drone_does():
     times = [clock.now(h) for h in (1.0, 0.5, 1.2, 5.0, 500.0)]
     assert times == sorted(times)
     assert times[-1] < 2.5
+
+
+def test_no_trajectory_ends_by_a_prediction_of_the_clock():
+    """A drone forty times as fast as real time, of which nothing comes for 0.4 s."""
+    clock = FirmwareClock()
+    for i in range(100):
+        clock.observe(0.4 * i, 0.01 * i)
+    stream = SetpointStream(link=None, trajectory=None, clock=clock)
+    stream.began = clock.newest
+    assert clock.now(1.39) > clock.newest + 10.0
+    assert stream.elapsed == 0.0
 
 
 def estimate(time=1.0):
