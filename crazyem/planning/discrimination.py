@@ -70,7 +70,7 @@ def flight_of(flown: Flown, vehicle: Vehicle, limits: Limits) -> Flight:
         time=flown.time, thrust=flown.command, voltage=voltage, flown=flown.time + 2.0, measured=False, delay=HELD
     )
     keep = slice(None, None, THINNED)
-    time = np.ascontiguousarray(flown.time[keep])  # as of recordings, for which the kernels are compiled
+    time = np.ascontiguousarray(flown.time[keep])  # as in recordings: one compiled kernel serves both
     starts = np.zeros(time.size, bool)
     starts[0] = True
     return Flight(

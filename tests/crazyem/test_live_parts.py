@@ -5,10 +5,12 @@ import math
 import random
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from crazyem.control.trajectories import hover
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
 from crazyem.live.clock import FirmwareClock
@@ -49,10 +51,15 @@ def test_no_trajectory_ends_by_a_prediction_of_the_clock():
     clock = FirmwareClock()
     for i in range(100):
         clock.observe(0.4 * i, 0.01 * i)
-    stream = SetpointStream(link=None, trajectory=None, clock=clock)
-    stream.began = clock.newest
     assert clock.now(1.39) > clock.newest + 10.0
+    link = SimpleNamespace(send_full_state=lambda *reference: None)
+    stream = SetpointStream(link, hover(position=(0.0, 0.0, 1.0), yaw=0.0, duration=9.0), clock)
+    stream.start()
+    stream.stop()
+    assert stream.failure is None
     assert stream.elapsed == 0.0
+    clock.observe(clock.newest + 2.0, 1.4)
+    assert stream.elapsed == pytest.approx(2.0)
 
 
 def estimate(time=1.0):
