@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from crazyem.control.indi import PARAMETERS, IndiGains
 from crazyem.control.trajectories import Trajectory, Vector, after_hover
 from crazyem.errors import CrazyemError, LinkError, UsageError
-from crazyem.links.base import ConfirmingLink, Link
+from crazyem.links.base import ConfirmingLink, HostClockLink, Link
 from crazyem.live.controllers import Controller
 from crazyem.live.session import Session
 from crazyem.live.stream import SetpointStream
@@ -115,7 +115,8 @@ class Flight:
         self._phase_start = math.nan
         self._handled = 0
         self._report = time.monotonic()
-        self._moved = (math.nan, time.monotonic())
+        self._host_clock = self.link.host_clock if isinstance(self.link, HostClockLink) else time.monotonic
+        self._moved = (math.nan, self._host_clock())
         self._stream: SetpointStream | None = None
         self._ground = 0.0
         self._may_fly = False
@@ -337,7 +338,7 @@ class Flight:
             time.sleep(0.005 / max(1.0, clock.rate))
 
     def _watch(self) -> None:
-        now = time.monotonic()
+        now = self._host_clock()
         if self.interrupts.count > self._handled:
             self._handled += 1
             if self._handled >= 2:
@@ -358,7 +359,7 @@ class Flight:
             raise CrazyemError(f"the flight was ended because of a fault: {self.session.landing_wanted}.")
         if self._stream is not None and self._stream.failure is not None:
             raise LinkError(f"setpoints could not be sent: {self._stream.failure}.")
-        if now - self._report >= REPORT_EVERY:
+        if (now := time.monotonic()) - self._report >= REPORT_EVERY:
             self._report = now
             seconds = self.session.clock.newest - self._phase_start
             self.progress(self.phase, seconds if math.isfinite(seconds) else 0.0)

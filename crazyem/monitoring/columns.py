@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from crazyem.estimation.model import Parameters
 from crazyem.estimation.tape import Tape
 from crazyem.monitoring import hypotheses as h
+from crazyem.physics.effects.onboard_estimate import LATERAL_SECONDS, path_errors
 from crazyem.physics.rotors import PITCH_SIGN, ROLL_SIGN, YAW_SIGN
 from crazyem.vehicle import Vehicle
 
@@ -20,7 +21,9 @@ DELAY_SD = 0.01
 # Standard deviations of the scales of velocities (an onboard filter that knows no drag has an error of 9 cm/s at
 # 1.45 m/s, docs: controller_parameters.md) and of body rates (BMI088: sensitivity within 1 %, 1 % with temperature).
 VELOCITY_SCALE_SD, RATE_SCALE_SD = 0.06, 0.02
-NUISANCES = 18  # parameters of the estimator, drag along x, y, z, delays of the four measured quantities, two scales
+# parameters of the estimator, drag along x, y, z, delays of the four measured quantities, two scales, the error of an
+# onboard filter that knows no drag
+NUISANCES = 19
 
 
 @dataclass(frozen=True)
@@ -68,8 +71,13 @@ class RowMaker:
         self.columns = columns
         self.mass = vehicle.mass
         matrix = mixing(vehicle)
+        self.restart()
         self._unmix = np.linalg.inv(matrix) if abs(np.linalg.det(matrix)) > 0 else None
         self._mix = matrix
+
+    def restart(self) -> None:
+        """A flight begins: an onboard filter has no error yet."""
+        self._filter_error = np.zeros((2, 3))  # m, m/s, for a drag over mass of 1/s
 
     def rows(self, tape: Tape, p: Parameters, first: int, last: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Effect of the columns in the steps that end at rows first..last-1.
@@ -122,7 +130,7 @@ class RowMaker:
 
         The nuisances are the nine parameters in the coordinates of the estimator (logarithms, units of the linear
         ones), drag along x, y, z [1/s], delays of position, velocity, attitude and rate [s], scales of velocity and
-        rate.
+        rate, drag along x and y that an onboard filter does not know [1/s]. The rows must follow those before.
         """
         acting = np.zeros((last - first, NUISANCES, 6))
         sensed = np.zeros((last - first, NUISANCES, 12))
@@ -155,7 +163,18 @@ class RowMaker:
         sensed[:, 15, 9:12] = -(tape.xp[first:last, 10:13] - w) / span
         sensed[:, 16, 3:6] = tape.xp[first:last, 3:6]
         sensed[:, 17, 9:12] = tape.xp[first:last, 10:13]
+        lateral = np.einsum("nij,nj->ni", tape.middle[first:last, :, :2], velocity[:, :2])
+        sensed[:, 18, 0:3], sensed[:, 18, 3:6] = self._filter_errors(span[:, 0], lateral)
         return acting, sensed
+
+    def _filter_errors(self, span: NDArray[np.float64], drag: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(2, n, 3) errors of position [m] and velocity [m/s] by accelerations `drag` (n, 3) over steps of span (n,) s
+        (see `path_error`)."""
+        errors = np.concatenate([self._filter_error[:, None], np.zeros((2, len(span), 3))], axis=1)
+        gap, drive = np.append(0.0, span), np.concatenate([np.zeros((1, 3)), drag])
+        path_errors(gap, np.zeros(len(gap), bool), drive, LATERAL_SECONDS, *errors)
+        self._filter_error = errors[:, -1].copy()
+        return errors[:, 1:]
 
     def drifting(self, tape: Tape, p: Parameters, reference: Parameters, first: int, last: int) -> NDArray[np.float64]:
         """Accelerations (n, 1, 6) with parameters `p` (those of the tape), less those with `reference`."""
@@ -177,5 +196,5 @@ class RowMaker:
     @staticmethod
     def precision(sd: NDArray[np.float64]) -> NDArray[np.float64]:
         """Prior precisions (M,) of the nuisances; sd: (9,) standard deviations of the estimator's parameters."""
-        own = np.repeat([DRAG_SD, DELAY_SD, VELOCITY_SCALE_SD, RATE_SCALE_SD], [3, 4, 1, 1])
+        own = np.repeat([DRAG_SD, DELAY_SD, VELOCITY_SCALE_SD, RATE_SCALE_SD, DRAG_SD], [3, 4, 1, 1, 1])
         return np.concatenate([np.maximum(sd, 1e-6), own]) ** -2.0

@@ -98,6 +98,7 @@ class Detector:
         self._restart(-math.inf)
 
     def _restart(self, time: float) -> None:
+        self._maker.restart()
         self._open: list[int] = []
         self._count = 0
         self._since = time

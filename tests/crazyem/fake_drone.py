@@ -37,7 +37,8 @@ def float32(value):
 class FakeLink:
     """A Link; `speed` firmware seconds pass per second, fewer where it must not outrun a session (`follow`)."""
 
-    def __init__(self, *, speed=20.0, controllers=(1, 5, 6), lose_echo_after=None, lost_at=None, nan_at=None):
+    def __init__(self, *, speed=20.0, controllers=(1, 5, 6), lose_echo_after=None, lost_at=None, nan_at=None,
+                 silent_at=None):  # fmt: skip
         self.uri = "fake://0"
         self.packets = queue.SimpleQueue()
         self.speed = speed
@@ -45,6 +46,7 @@ class FakeLink:
         self.lose_echo_after = lose_echo_after
         self.lost_at = lost_at
         self.nan_at = nan_at
+        self.silent_at = silent_at
         self.log_variables = dict.fromkeys(
             (*STATE_VARIABLES, *MOTOR_BLOCK, *EXTRA_VARIABLES, *(f"ctrlLee.{n}" for n in WRENCH_VARIABLES)), "float"
         )
@@ -184,6 +186,9 @@ class FakeLink:
             self.fm += STEP
             if self.lost_at is not None and self.fm > self.lost_at:
                 self.packets.put(LinkLost("the link closed.", self.host_clock()))
+                self._silent_since = time.monotonic()
+                return
+            if self.silent_at is not None and self.fm > self.silent_at:
                 self._silent_since = time.monotonic()
                 return
             sag = SAG * (0.036 - self.values["ctrlLee.mass"]) / 0.007

@@ -1,5 +1,8 @@
 """The flight loop against a fake drone: the order of things, and every way out of a flight."""
 
+import time
+from types import SimpleNamespace
+
 import pytest
 from fake_drone import FakeLink
 from fake_flight import Estimator, FakeFlight
@@ -63,6 +66,24 @@ def test_an_unconfirmed_write_ends_pushing_but_not_the_flight():
     assert any("not confirmed" in n for n in flown.history.notices)
     assert flown.error is None
     assert landed(flown.link)
+
+
+def test_a_silent_drone_is_lost(monkeypatch):
+    monkeypatch.setattr("crazyem.live.flight.LOST_AFTER_SILENCE", 0.3)
+    flown = FakeFlight(FakeLink(silent_at=8000), duration=60.0).fly()
+    assert isinstance(flown.error, LinkError)
+    assert "nothing was received for 0.3 s" in str(flown.error)
+
+
+def test_silence_counts_in_the_time_of_the_link(monkeypatch):
+    """A simulated drone that waits for this process is not silent."""
+    flown = FakeFlight(FakeLink(), duration=2.0).fly()
+    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + 60.0)
+    monkeypatch.setattr("crazyem.live.flight.time", clock)
+    flown.flight._watch()
+    monkeypatch.setattr(flown.link, "fm", flown.link.fm + 60_000 * flown.link.speed)
+    with pytest.raises(LinkError, match="nothing was received"):
+        flown.flight._watch()
 
 
 def bad_trajectory(**_):

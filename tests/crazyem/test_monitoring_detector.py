@@ -3,9 +3,11 @@
 A rotor that lost a tenth of its thrust is one whose command says 1/0.9 of what acts; the flight itself goes on.
 """
 
-from collections.abc import Callable, Iterable
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from crazyem.monitoring.columns import Columns, RowMaker, mixing
 from crazyem.monitoring.detector import Detector
 from crazyem.monitoring.fault import Fault
 from crazyem.monitoring.hypotheses import hypotheses_for
+from crazyem.physics.effects.onboard_estimate import LATERAL_SECONDS
 from crazyem.physics.rotors import wrench
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import load_vehicle
@@ -151,6 +154,34 @@ def test_every_column_of_the_body_is_the_derivative_of_the_model(flight: list[Sa
         theta[column] *= np.exp(1e-6)
         moved = maker.drifting(em.tape, replace(p, theta=theta), p, first, last)[:, 0] / 1e-6
         np.testing.assert_allclose(change[:, column], moved, rtol=1e-4, atol=1e-4)
+
+
+def test_an_onboard_filter_that_knows_no_drag_is_a_nuisance() -> None:
+    """At constant velocity the error of v along body x and y is T v, that of p is T^2 v / 2, and along z there is none;
+    rows one by one give the same as all at once."""
+    rows, velocity = 400, np.array([1.0, -0.5, 0.3])
+    xf = np.zeros((rows, 13))
+    xf[:, 3:6] = velocity
+    tape = SimpleNamespace(
+        time=0.01 * np.arange(rows), xf=xf, xp=xf, middle=np.tile(np.eye(3), (rows, 1, 1)),
+        thrust=np.zeros(rows), torque=np.zeros((rows, 3)), thrust_tau=np.zeros(rows), torque_tau=np.zeros((rows, 3)),
+        thrust_delay=np.zeros(rows), torque_delay=np.zeros((rows, 3)),
+    )  # fmt: skip
+    p = SimpleNamespace(theta=np.ones(9), inertia=np.eye(3), inverse=np.eye(3))
+
+    def error(batches: Sequence[int]) -> Any:
+        maker = RowMaker(Columns.of(hypotheses_for(VEHICLE)), VEHICLE)
+        found = [
+            maker.nuisances(cast(Any, tape), cast(Any, p), np.ones(9), first, last)[1]
+            for first, last in itertools.pairwise(batches)
+        ]
+        return np.concatenate(found)[:, 18]
+
+    whole = error((1, rows))
+    assert whole[-1, 3:6] == pytest.approx(LATERAL_SECONDS * velocity * [1.0, 1.0, 0.0])
+    assert whole[-1, 0:3] == pytest.approx(0.5 * LATERAL_SECONDS**2 * velocity * [1.0, 1.0, 0.0])
+    assert (np.diff(whole[:20, 3]) > 0.0).all()
+    np.testing.assert_allclose(error((1, 2, 3, 50, 51, rows)), whole, rtol=1e-12)
 
 
 @pytest.mark.parametrize("per_hour", [0.01, 1.0])

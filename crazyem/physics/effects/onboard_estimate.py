@@ -26,6 +26,7 @@ from crazyem.physics.effects.prior import Conditions, Prior, Sizes
 from crazyem.vehicle import GRAVITY
 
 CORRECTION_SECONDS = 0.04  # s, T above
+LATERAL_SECONDS = 0.2  # s, usual time constant of `path_error`
 MEMORY_SECONDS = 3.0 * CORRECTION_SECONDS  # s; older errors of the gyro are 5 % of an attitude's error
 
 
@@ -65,10 +66,10 @@ def attitude_error(situation: Situation, rate_error: NDArray, *, delay: float) -
 
 
 @compiled
-def _path_errors(gap, broken, drive, time, position, velocity):
+def path_errors(gap, broken, drive, time, position, velocity):
     """Errors of position and velocity (n, 3) at every row, from mean accelerations `drive` (n, 3) over the steps that
-    end there; 0 where a stretch begins (`path_error`)."""
-    for k in range(len(gap)):
+    end there; 0 where a stretch begins, row 0 as given (`path_error`)."""
+    for k in range(1, len(gap)):
         if broken[k]:
             position[k] = 0.0
             velocity[k] = 0.0
@@ -98,7 +99,7 @@ def path_error(situation: Situation, time_constant: float) -> tuple[NDArray, NDA
         if situation.tilt is not None:
             unknown = unknown + force[:, 2:] * np.stack([situation.tilt[:, 1], -situation.tilt[:, 0]], axis=1)
         drive = np.einsum("nij,nj->ni", situation.rotation[:, :, :2], unknown)
-        _path_errors(gap, broken, np.ascontiguousarray(drive), time_constant, position, velocity)
+        path_errors(gap, broken, np.ascontiguousarray(drive), time_constant, position, velocity)
     return position, velocity
 
 
@@ -149,7 +150,11 @@ RATE_LAGS = {True: (1.2e-3, 0.7e-3), False: (2.8e-3, 1.5e-3)}
 
 def _mean_lags(conditions: Conditions) -> Sizes:
     """s: means of the lags, see `_lags`."""
-    return {"rate_lag": RATE_LAGS[conditions.onboard][0], "velocity_lag": 0.6e-3, "lateral_time_constant": 0.2}
+    return {
+        "rate_lag": RATE_LAGS[conditions.onboard][0],
+        "velocity_lag": 0.6e-3,
+        "lateral_time_constant": LATERAL_SECONDS,
+    }
 
 
 ONBOARD_FILTER = Effect(
