@@ -113,7 +113,8 @@ class NoiseFit:
     start_sd: tuple[float, ...] = (1.0, 2.0, 0.5, 3.0)  # m, m/s, rad, rad/s; of what is not measured at a start
     min_lateral: float = 0.05  # share of the force along x and y in a column, for which onboard estimates depend on it
     averaging: float = 0.5  # s; of the acceleration that a model lacks: much longer than a sample
-    vibration_period: float = 0.2  # s; slower changes of an accelerometer are motion
+    max_force_decay: float = 0.999  # from row to row, of the noise of an accelerometer: 10 s at 100 Hz
+    min_forces: int = 100  # samples of an accelerometer: a second
     min_vibration: float = 0.05  # m/s^2; resolution and vibration of an accelerometer in flight
     max_force_residual: float = 6.0  # standard deviations at which residuals of an accelerometer are clipped
     chaos_velocity: float = 0.01  # m/s; error of an onboard velocity, by which a test for chaos moves the path

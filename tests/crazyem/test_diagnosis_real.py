@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_flight import array_of
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from crazyem.diagnosis.fitting import specific_force
 from crazyem.diagnosis.flights.alignment import Alignment
@@ -156,7 +157,7 @@ def test_a_signal_may_be_withheld_by_the_name_that_the_firmware_has_for_it() -> 
 # -- the accelerometer as evidence -------------------------------------------------------------------------------------
 
 
-def felt_flight(force: NDArray, *, position: bool = False) -> Flight:
+def felt_flight(force: NDArray, *, position: bool = False, fused: bool = False) -> Flight:
     n = len(force)
     time = np.arange(n) * 0.01
     y = np.full((n, 13), np.nan)
@@ -167,41 +168,83 @@ def felt_flight(force: NDArray, *, position: bool = False) -> Flight:
     rotor = RotorInput(time, np.zeros((n, 4)), np.full(n, np.nan), time, measured=False)
     block = (np.arange(n) // 100).astype(np.int64)
     return Flight("made", time, starts, starts, y, force, np.full(n, np.nan), time, 0.0, block, rotor,
-                  frozenset({"body_rate", "specific_force"}))  # fmt: skip
+                  frozenset({"body_rate", "specific_force"}), fused=fused)  # fmt: skip
 
 
 def test_the_accelerometer_counts_only_where_nothing_else_shows_forces() -> None:
     force = np.zeros((300, 3))
-    assert specific_force.is_needed(felt_flight(force))
-    assert not specific_force.is_needed(felt_flight(force, position=True))
-    assert not specific_force.is_needed(felt_flight(np.full((300, 3), np.nan)))
+    assert specific_force.axes_needed(felt_flight(force)) == (0, 1, 2)
+    assert specific_force.axes_needed(felt_flight(force, position=True)) == ()
+    assert specific_force.axes_needed(felt_flight(force, position=True, fused=True)) == (0, 1)
+    assert specific_force.axes_needed(felt_flight(np.full((300, 3), np.nan))) == ()
 
 
-def test_score_and_information_are_derivatives_of_its_likelihood() -> None:
+@pytest.mark.parametrize("axes", [(0, 1, 2), (0, 1)])
+def test_score_and_information_are_derivatives_of_its_likelihood(axes: tuple[int, ...]) -> None:
+    """Of the likelihood of the same noise: the noise that suits a model best moves with the model by little."""
     rng = np.random.default_rng(2)
-    force = rng.normal(size=(350, 3))
+    force = lfilter([1.0], [1.0, -0.9], rng.normal(size=(3500, 3)), axis=0)
     force[40] = np.nan
     flight = felt_flight(force)
-    model, acting = rng.normal(size=(350, 3)), 0.1 * rng.normal(size=(350, 3, 4))
-    noise, bias = np.array([0.8, 1.0, 1.3]), np.array([0.1, -0.2, 0.0])
+    model, acting = np.zeros((3500, 3)), 0.1 * rng.normal(size=(3500, 3, 4))
+    errors = rng.normal(size=(3500, 2, 9))
 
     def loglik(theta: NDArray) -> float:
-        return specific_force.evidence(flight, model + acting @ theta, acting[:, :, :0], noise, bias)[0]
+        moved = model + acting @ theta
+        return float(specific_force.evidence(flight, moved, acting[:, :, :0], errors, axes)[0].sum())
 
-    _, score, information = specific_force.evidence(flight, model, acting, noise, bias)
-    h = 1e-4
+    _, score, information = specific_force.evidence(flight, model, acting, errors, axes)
+    h = 0.3
     for i in range(4):
         e = np.eye(4)[i] * h
-        assert score.sum(0)[i] == pytest.approx((loglik(e) - loglik(-e)) / (2 * h), rel=1e-4)
+        assert score.sum(0)[i] == pytest.approx((loglik(e) - loglik(-e)) / (2 * h), rel=0.05, abs=0.2)
         bend = (loglik(e) - 2 * loglik(0 * e) + loglik(-e)) / h**2
-        assert information.sum(0)[i, i] == pytest.approx(-bend, rel=1e-2)
+        assert information.sum(0)[i, i] == pytest.approx(-bend, rel=0.1)
 
 
-def test_vibration_is_what_is_faster_than_motion() -> None:
-    rng = np.random.default_rng(3)
-    slow = np.sin(np.arange(3000) * 0.01)[:, None] * np.array([1.0, 2.0, 3.0])
-    quiet = felt_flight(slow + 0.3 * rng.standard_normal((3000, 3)))
-    assert specific_force.vibration(quiet, np.zeros((3000, 3))) == pytest.approx([0.3, 0.3, 0.3], rel=0.1)
+def test_a_badly_mounted_accelerometer_shows_no_lateral_force() -> None:
+    """By kinematics: a sensor at r, tilted by a rotation, biased and late, on a body that turns. Only a force along x
+    that none of these makes is evidence."""
+    rng = np.random.default_rng(4)
+    time = np.arange(3000) * 0.01
+    waves = [np.sum([np.sin(f * time + rng.uniform(0, 6)) for f in rng.uniform(0.5, 8.0, 4)], 0) for _ in range(6)]
+    rate, force = np.stack(waves[:3], 1), np.stack([0.3 * waves[3], 0.3 * waves[4], 9.8 + waves[5]], 1)
+    turning = np.gradient(rate, time, axis=0)
+    place, tilt, lag = np.array([0.004, -0.003, 0.006]), np.array([0.02, -0.015]), 0.006
+    shown = force + np.cross(turning, place) + np.cross(rate, np.cross(rate, place)) + 0.1 * rng.normal(size=(3000, 3))
+    shown[:, :2] += tilt * force[:, 2:] + [0.1, -0.2] - lag * np.gradient(force[:, :2], time, axis=0)
+    flight = felt_flight(shown, position=True, fused=True)
+    errors = specific_force.sensor_errors(flight, force, rate)
+    drag = np.zeros((3000, 3, 1))
+    drag[:, 0, 0] = np.sin(0.7 * time)
+    _, score, information = specific_force.evidence(flight, force, drag, errors, (0, 1))
+    sd = information.sum() ** -0.5
+    assert sd == pytest.approx(0.1 * np.sqrt(2.0 / 3000), rel=0.2)
+    assert abs(score.sum() / information.sum()) < 3.0 * sd
+    less = force - 0.05 * drag[:, :, 0]
+    _, score, information = specific_force.evidence(flight, less, drag, errors, (0, 1))
+    assert score.sum() / information.sum() == pytest.approx(0.05, abs=3.0 * sd)
+    assert information.sum() ** -0.5 < 0.05 / 3.0
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.3, 1.5])
+def test_the_noise_of_an_accelerometer_is_found(memory: float) -> None:
+    """White noise of 0.1 m/s^2, and a force of 0.4 m/s^2 with a memory, simulated exactly."""
+    rng = np.random.default_rng(5)
+    decay = np.exp(-0.01 / memory) if memory else 0.0
+    start = 0.4 * rng.standard_normal()
+    slow = lfilter([1.0], [1.0, -decay], 0.4 * np.sqrt(1.0 - decay**2) * rng.standard_normal(12000), zi=[decay * start])
+    residual = 0.1 * rng.standard_normal(12000) + (slow[0] if memory else 0.0)
+    found, white = specific_force.noise_of(residual), specific_force.noise_of(residual, decay=0.0)
+    if memory:
+        assert -0.01 / np.log(found.decay) == pytest.approx(memory, rel=0.4)
+        assert found.spread(residual) == pytest.approx(0.4, rel=0.2)
+        assert found.loglik - white.loglik > 1000.0
+        known = specific_force.noise_of(residual, decay=float(decay))
+        assert known.loglik == pytest.approx(found.loglik, abs=5.0)
+    else:
+        assert found.loglik - white.loglik < 5.0
+        assert np.std(found.white(residual)) == pytest.approx(0.1, rel=0.05)
 
 
 # -- real recordings ---------------------------------------------------------------------------------------------------

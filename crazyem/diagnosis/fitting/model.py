@@ -143,8 +143,7 @@ class Model:
     _row_situation: Situation | None = None  # at the rows
     _offsets: dict[str, Offset] = field(default_factory=dict)  # of single effects, at `_row_situation`
     _diverging: dict[str, bool] = field(default_factory=dict)  # effect -> `diverges`; shared by twins
-    _force_needed: bool | None = None
-    _vibration: NDArray | None = None
+    _force_axes: tuple[int, ...] | None = None
 
     def twin(self) -> "Model":
         """A copy with the same stored arrays; they are shared, because they are replaced and never changed."""
@@ -240,8 +239,7 @@ class Model:
         offset = self.offsets(point, acceleration)
         acting, showing, order = self.derivatives(point, columns, acceleration, offset, workers or Workers(1))
         swept = run_sweep(flight, acceleration, offset, acting, showing, point.noise)
-        if self._needs_specific_force():
-            swept = self._with_specific_force(swept, acceleration, acting)
+        swept = self._with_specific_force(swept, acceleration, acting)
         if order is not None:
             swept = _in_order(swept, order)
         self._path_situation = self._row_situation = None
@@ -257,23 +255,31 @@ class Model:
         self.observed_force = observed_force(acceleration, *found)
         return swept
 
-    def _needs_specific_force(self) -> bool:
-        if self._force_needed is None:
-            self._force_needed = specific_force.is_needed(self.flight)
-        return self._force_needed
+    @property
+    def force_axes(self) -> tuple[int, ...]:
+        """Axes along which only the accelerometer shows forces."""
+        if self._force_axes is None:
+            self._force_axes = specific_force.axes_needed(self.flight)
+        return self._force_axes
+
+    def force_residuals(self, point: Point) -> NDArray:
+        """(m, 3) m/s^2: accelerometer less model, without the sensor's errors; the filter must have settled."""
+        swept, force = self.sweep(point), self.accelerations(point)[0][:, :3]
+        errors = specific_force.sensor_errors(self.flight, force, swept.filtered[:, 10:13])
+        return specific_force.residuals(self.flight, force, errors)[1]
 
     def _with_specific_force(self, swept: Swept, acceleration: NDArray, acting: NDArray) -> Swept:
-        """The pass with the evidence of the accelerometer (`specific_force.py`) added."""
-        if self._vibration is None:
-            self._vibration = specific_force.vibration(self.flight, acceleration[:, :3])
-        bias = np.append(np.nanmedian(self.flight.force[:, :2] - acceleration[:, :2], axis=0), 0.0)
-        loglik, score, information = specific_force.evidence(
-            self.flight, acceleration[:, :3], acting[:, :3], self._vibration, bias
-        )
+        """The pass with the evidence of the accelerometer (`specific_force.py`) added, where it is needed."""
+        axes = self.force_axes
+        if not axes or not np.isfinite(swept.filtered).all():
+            return swept
+        force = acceleration[:, :3]
+        errors = specific_force.sensor_errors(self.flight, force, swept.filtered[:, 10:13])
+        rows, score, information = specific_force.evidence(self.flight, force, acting[:, :3], errors, axes)
         if acting.shape[2] and swept.score.size:
             swept.score[:, : acting.shape[2]] += score
             swept.information[:, : acting.shape[2], : acting.shape[2]] += information
-        return replace(swept, loglik=swept.loglik + loglik)
+        return replace(swept, loglik=swept.loglik + float(rows.sum()), rows=swept.rows + rows)
 
     def derivatives(
         self,

@@ -3,8 +3,10 @@
 Gusts have no deterministic term, so they are no column of the regression. The filter has a disturbing specific force
 (Ornstein-Uhlenbeck, body axes) as states. Its stationary standard deviation is fitted with the other noise scales for
 several correlation times. A parabola of the log-likelihood over the log of this time gives the best time and its error.
+Where only the accelerometer shows lateral forces (`fitting/specific_force.py`), its noise gives their size and gain.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Noise, Point
+from crazyem.diagnosis.fitting.specific_force import noise_of
 from crazyem.diagnosis.settings import WIND
 from crazyem.physics.effects.drag import LINEAR_DRAG
 
@@ -37,16 +40,37 @@ class Gusts:
     speed_sd: float
 
 
+def _lateral(residuals: Sequence[tuple[NDArray, float]], memory: float) -> tuple[float, float]:
+    """Gain [nats] over white noise and standard deviation [m/s^2] of a force with a memory [s].
+
+    residuals: (n,) of an accelerometer along one axis in each flight, with the time between rows [s].
+    """
+    gain, spreads = 0.0, []
+    for residual, period in residuals:
+        noise = noise_of(residual, decay=float(np.exp(-period / memory)))
+        gain += noise.loglik - noise_of(residual, decay=0.0).loglik
+        spreads.append(noise.spread(residual))
+    return gain, float(np.sqrt(np.mean(np.square(spreads))))
+
+
 def find_gusts(data: Data, point: Point) -> Gusts | None:
     """The disturbing force with memory; None if its gain or its size is too small."""
     white = data.loglik(point, passes=2)
+    shown = [(m.force_residuals(point), float(np.median(np.diff(m.flight.time)))) for m in data.models if m.force_axes]
+    lateral = [[(residual[:, axis], period) for residual, period in shown] for axis in range(2)] if shown else []
 
     def fitted(memory: float, start: Noise, spread: NDArray) -> tuple[float, Point]:
+        beside = [_lateral(residuals, memory) for residuals in lateral]
+        if lateral:
+            spread = np.array([0.0, 0.0, spread[2]])
         torques = point.noise.disturbance[3:], np.broadcast_to(np.asarray(point.noise.memory, float), (6,))[3:]
         noise = replace(start, disturbance=np.concatenate([spread, torques[0]]),
                         memory=np.concatenate([np.full(3, memory), torques[1]]))  # fmt: skip
         found = data.fit_noise(replace(point, noise=noise))
-        return data.loglik(found, passes=2), found
+        value = data.loglik(found, passes=2) + sum(gain for gain, _ in beside)
+        shown = [s for _, s in beside] or found.noise.disturbance[:2]
+        disturbance = np.concatenate([shown, found.noise.disturbance[2:]])
+        return value, replace(found, noise=replace(found.noise, disturbance=disturbance))
 
     first = fitted(1.0, point.noise, np.full(3, 0.1))
     if first[0] - white < 0.5 * WIND.min_gain or first[1].noise.disturbance[:3].max() < 0.7 * WIND.min_spread:

@@ -10,7 +10,7 @@ from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point, Swept
 from crazyem.diagnosis.locating.locate import AXES, Finding, Located, strongest
 from crazyem.diagnosis.locating.random_torques import AT_RANDOM, erratic_rotor, humps, memoryless
-from crazyem.diagnosis.naming.trials import Selection
+from crazyem.diagnosis.naming.trials import Selection, own_evidence
 from crazyem.diagnosis.settings import LOCATION, SPECTRUM
 from crazyem.vehicle import GRAVITY
 
@@ -94,7 +94,8 @@ def unexplained(data: Data, selection: Selection, after: Located, apart: Data | 
     erratic = erratic_rotor(everything.models, quiet)
     left += [erratic] if erratic and notable(erratic, point, differ=data.differ) else []
     left.sort(key=lambda f: -f.nats)
-    gained = sum(s.taken.evidence for s in selection.steps if s.taken)
+    # of the final model: beside all the others, an effect may gain more than when it was found
+    gained = sum(max(own_evidence(s.taken, counted=apart is not None), 0.0) for s in selection.steps if s.taken)
     return Unexplained(tuple(left[:12]), gained)
 
 
