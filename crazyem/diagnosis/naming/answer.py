@@ -79,7 +79,8 @@ def answer_of(
         rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, selection, corroborated), balance)
         against = _against(remains, candidate, data)
         there = step.taken.presence(order)
-        there *= confidence_factor(against, step.taken.held_out) if step.taken.log_odds is None else 1.0
+        held = step.taken.held_out / step.taken.dispersion
+        there *= confidence_factor(against, held) if step.taken.log_odds is None else 1.0
         confidence = there * preferred(step.taken, rivals)
         confidence /= 1.0 + sum(float(np.exp(-nats)) for nats in steady.values())
         # late inputs and late measurements are one model: fitted as the former, named by corroboration

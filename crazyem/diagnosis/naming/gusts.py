@@ -40,7 +40,7 @@ class Gusts:
     speed_sd: float
 
 
-def _lateral(residuals: Sequence[tuple[NDArray, float]], memory: float) -> tuple[float, float]:
+def lateral_force(residuals: Sequence[tuple[NDArray, float]], memory: float) -> tuple[float, float]:
     """Gain [nats] over white noise and standard deviation [m/s^2] of a force with a memory [s].
 
     residuals: (n,) of an accelerometer along one axis in each flight, with the time between rows [s].
@@ -60,7 +60,7 @@ def find_gusts(data: Data, point: Point) -> Gusts | None:
     lateral = [[(residual[:, axis], period) for residual, period in shown] for axis in range(2)] if shown else []
 
     def fitted(memory: float, start: Noise, spread: NDArray) -> tuple[float, Point]:
-        beside = [_lateral(residuals, memory) for residuals in lateral]
+        beside = [lateral_force(residuals, memory) for residuals in lateral]
         if lateral:
             spread = np.array([0.0, 0.0, spread[2]])
         torques = point.noise.disturbance[3:], np.broadcast_to(np.asarray(point.noise.memory, float), (6,))[3:]

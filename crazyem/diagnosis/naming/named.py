@@ -63,14 +63,13 @@ def interval_95(value: float, sd: float) -> tuple[float, float]:
 def confidence_factor(remains: Unexplained, held_out_nats: float = 0.0) -> float:
     """Factor on the probability of an effect beside unexplained structure: the right model leaves none.
 
-    Physics outside the catalogue imitates effects of about its own size. An effect with a far larger held-out gain is
-    no such imitation.
+    Physics outside the catalogue imitates effects of about its own size. An effect with a far larger held-out gain,
+    over the dispersion of its scores, is no such imitation.
     """
-    explained = max(remains.explained, 0.0)
     if not remains.found:
-        return explained
+        return 1.0
     times = max(held_out_nats, 0.0) / max(remains.nats, 1e-9)
-    return min(explained, max(CONFIDENCE.doubtful, times**2 / (times**2 + CONFIDENCE.outweighs**2)))
+    return max(CONFIDENCE.doubtful, times**2 / (times**2 + CONFIDENCE.outweighs**2))
 
 
 def one_factor(values: NDArray, neutral: NDArray, covariance: NDArray) -> bool:

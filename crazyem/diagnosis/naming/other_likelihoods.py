@@ -1,7 +1,6 @@
 """Effects that are no column of the regression: gusts, a tilted accelerometer, rotors that follow commands late."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.special import logit
@@ -55,9 +54,7 @@ def other_likelihoods(
                 there = find_gusts(apart, point)
                 held = there.gain if there else 0.0
             if held > 0:
-                # the gain of the regression says nothing of gusts: their own gain counts
-                left = replace(remains.without_force(), gained=gusts.gain)
-                sure = confidence_factor(left, held) * presence(gusts.gain, held, gusts.gain)
+                sure = confidence_factor(remains.without_force(), held) * presence(gusts.gain, held, gusts.gain)
                 found.append(Named(GUSTS.name, GUSTS.name, values, {}, held, sure, log_odds=float(logit(sure))))
     if not wanted or accelerometer.EFFECT in wanted:
         solution = accelerometer.tilt(data, point)
