@@ -208,14 +208,14 @@ def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
     return frozenset(t.candidate.effect for t in fitted if 0 < SELECTION.kept_share * t.gain < left[t.candidate.effect])
 
 
-def own_evidence(trial: Trial, *, counted: bool) -> float:
+def tempered_evidence(trial: Trial, *, counted: bool) -> float:
     """Evidence of a trial at its own dispersion [nats]; `counted`: with that of held-out flights."""
     return (trial.gain + (trial.held_out if counted else 0.0)) / trial.dispersion - len(trial.candidate.free)
 
 
 def is_explanation(trial: Trial, *, counted: bool) -> bool:
     """Whether a trial exceeds its detection limit and has enough evidence of its own."""
-    return trial.admissible and own_evidence(trial, counted=counted) > SELECTION.min_evidence
+    return trial.admissible and tempered_evidence(trial, counted=counted) > SELECTION.min_evidence
 
 
 def dispersion_of(fitted: Fitted, count: int, *, offset: int) -> float:

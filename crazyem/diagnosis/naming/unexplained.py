@@ -10,7 +10,7 @@ from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point, Swept
 from crazyem.diagnosis.locating.locate import AXES, Finding, Located, strongest
 from crazyem.diagnosis.locating.random_torques import AT_RANDOM, erratic_rotor, humps, memoryless
-from crazyem.diagnosis.naming.trials import Selection, own_evidence
+from crazyem.diagnosis.naming.trials import Selection, tempered_evidence
 from crazyem.diagnosis.settings import LOCATION, SPECTRUM
 from crazyem.vehicle import GRAVITY
 
@@ -95,7 +95,7 @@ def unexplained(data: Data, selection: Selection, after: Located, apart: Data | 
     left += [erratic] if erratic and notable(erratic, point, differ=data.differ) else []
     left.sort(key=lambda f: -f.nats)
     # of the final model: beside all the others, an effect may gain more than when it was found
-    gained = sum(max(own_evidence(s.taken, counted=apart is not None), 0.0) for s in selection.steps if s.taken)
+    gained = sum(max(tempered_evidence(s.taken, counted=apart is not None), 0.0) for s in selection.steps if s.taken)
     return Unexplained(tuple(left[:12]), gained)
 
 
