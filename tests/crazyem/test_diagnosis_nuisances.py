@@ -100,6 +100,10 @@ def test_intervals_hold_what_no_scatter_shows():
     never = systematic_sd(flown(speed=0.7), heavy)  # type: ignore[arg-type]
     # an attitude 1 ms late, at 3.1 rad/s: force over velocity = mass * rate^2 * delay
     assert never["linear_drag", "y"] == pytest.approx(DRONE.mass * 3.1**2 * 1e-3, rel=0.3)
+    dragged = POINT.with_effects({"linear_drag": {"x": 0.03}})  # of rotors whose mean speed differs by 5 %
+    fast = systematic_sd(flown(speed=0.7), dragged)  # type: ignore[arg-type]
+    assert fast["linear_drag", "x"] == pytest.approx(np.hypot(0.05 * 0.03, never["linear_drag", "x"]))
+    assert fast["linear_drag", "y"] == never["linear_drag", "y"]
     assert never["rotor_inertia", "inertia"] == pytest.approx(AT_ONCE_SD * 2e-8)
     assert never["input_delay", "delay"] > 0  # and of what is always free
     assert ("thrust_scale", "scale") not in never

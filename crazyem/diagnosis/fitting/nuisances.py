@@ -177,7 +177,8 @@ def systematic_sd(data: Data, point: Point) -> dict[tuple[str, str], float]:
         prior = CATALOGUE[name].prior if name in CATALOGUE else Prior()
         chaotic = prior.relative_error_chaotic and any(m.diverges(name, point.vehicle) for m in data.models)
         for n, share in {**prior.relative_error, **(prior.relative_error_chaotic if chaotic else {})}.items():
-            known[name, n] = share * (point.vehicle.mass if prior.per.get(n) == "mass" else abs(float(here[n])))
+            whole = point.vehicle.mass if prior.per.get(n) == "mass" else abs(float(here.get(n, 0.0)))
+            known[name, n] = math.hypot(known.get((name, n), 0.0), share * whole)
     return {**known, **free}
 
 

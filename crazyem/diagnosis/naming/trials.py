@@ -93,12 +93,17 @@ class Step:
         A trial explains it if it is admissible and has positive evidence on all flights, or a larger `value` than the
         trial that was taken. The second rule is for effects that a slow flight does not determine: a quadratic drag
         fitted to slow flight makes a quick one worse, and explains both once fitted to both. Look-alikes of the trial
-        that was taken explain it in any case.
+        that was taken explain it in any case. What explains next to nothing of the fitted flights is about something
+        else in the held-out ones.
         """
         return [t for t in self.trials if self._explains(t) or any(t is a for a in self.alike)]
 
     def _explains(self, trial: Trial) -> bool:
-        better_on_all = self.taken is not None and trial.value > self.taken.value
+        better_on_all = (
+            self.taken is not None
+            and trial.value > self.taken.value
+            and trial.gain > SELECTION.gain_share * self.taken.gain
+        )
         return trial.admissible and (trial.evidence > 0 or better_on_all)
 
 

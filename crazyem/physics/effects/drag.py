@@ -25,6 +25,10 @@ def _of_real_rotors(names: str, size: float) -> Callable[[Conditions], Sizes]:
 SYSTEMATIC = in_turn("x y z", 3e-4, 3e-4, 1e-3)
 DETECTABLE = in_turn("x y z", 1e-3, 1e-3, 3e-3)  # N s/m, N s^2/m^2; along z, the thrust has a small error
 
+# Drag of rotors is proportional to their speed (Svacha et al. 2017), and the mean speed differs between flights: by 5 %
+# with 10 % of thrust.
+SPEED_SHARE = 0.05
+
 LINEAR_DRAG = Effect(
     "linear_drag",
     tuple(Parameter(axis, "N s/m", 0.0, 0.0, 0.5, 1e-3) for axis in "xyz"),
@@ -37,6 +41,7 @@ LINEAR_DRAG = Effect(
         alike("x y z", 0.012),
         _of_real_rotors("x y z", 0.02),
         systematic=SYSTEMATIC,
+        relative_error=alike("x y z", SPEED_SHARE),
         detection_limit=DETECTABLE,
         usual_named=True,
     ),
