@@ -27,6 +27,8 @@ from scipy.signal import lfilter
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.settings import NOISE
 
+LATERAL = (0, 1)  # axes along which an onboard filter knows no force
+
 
 @dataclass(frozen=True)
 class ForceNoise:
@@ -53,7 +55,7 @@ def axes_needed(flight: Flight) -> tuple[int, ...]:
         return ()
     if not np.isfinite(flight.y[:, 0:6]).any():
         return (0, 1, 2)
-    return (0, 1) if flight.fused else ()
+    return LATERAL if flight.fused else ()
 
 
 def loglik_of(white: NDArray) -> NDArray:

@@ -289,7 +289,8 @@ def _by_regime(
         if np.any(np.diag(total_a) <= 0):
             continue
         theta = bounded(total_a, total_b, None, None)
-        one = total_b.sum() / total_a.sum()
+        whole = total_a.sum()  # 0 for what is the same in all bins if a nuisance takes that up (a sensor's bias)
+        one = total_b.sum() / whole if whole > 1e-9 * np.trace(total_a) else 0.0
         gain = 0.5 * total_b @ theta - 0.5 * total_b.sum() * one
         residual = b - a @ theta
         scatter = max(1.0, float(np.sum(residual**2) / np.trace(total_a) * len(b) / max(len(b) - LOCATION.bins, 1)))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Noise, Point
-from crazyem.diagnosis.fitting.specific_force import noise_of
+from crazyem.diagnosis.fitting.specific_force import LATERAL, noise_of
 from crazyem.diagnosis.settings import WIND
 from crazyem.physics.effects.drag import LINEAR_DRAG
 
@@ -56,20 +56,21 @@ def lateral_force(residuals: Sequence[tuple[NDArray, float]], memory: float) -> 
 def find_gusts(data: Data, point: Point) -> Gusts | None:
     """The disturbing force with memory; None if its gain or its size is too small."""
     white = data.loglik(point, passes=2)
-    shown = [(m.force_residuals(point), float(np.median(np.diff(m.flight.time)))) for m in data.models if m.force_axes]
-    lateral = [[(residual[:, axis], period) for residual, period in shown] for axis in range(2)] if shown else []
+    hidden = [m for m in data.models if m.force_axes == LATERAL]
+    left = [(m.force_residuals(point), float(np.median(np.diff(m.flight.time)))) for m in hidden]
+    lateral = [[(residual[:, axis], period) for residual, period in left] for axis in range(2)] if left else []
 
     def fitted(memory: float, start: Noise, spread: NDArray) -> tuple[float, Point]:
-        beside = [lateral_force(residuals, memory) for residuals in lateral]
-        if lateral:
+        found_lateral = [lateral_force(residuals, memory) for residuals in lateral]
+        if lateral:  # the filter finds the force along z alone
             spread = np.array([0.0, 0.0, spread[2]])
         torques = point.noise.disturbance[3:], np.broadcast_to(np.asarray(point.noise.memory, float), (6,))[3:]
         noise = replace(start, disturbance=np.concatenate([spread, torques[0]]),
                         memory=np.concatenate([np.full(3, memory), torques[1]]))  # fmt: skip
         found = data.fit_noise(replace(point, noise=noise))
-        value = data.loglik(found, passes=2) + sum(gain for gain, _ in beside)
-        shown = [s for _, s in beside] or found.noise.disturbance[:2]
-        disturbance = np.concatenate([shown, found.noise.disturbance[2:]])
+        value = data.loglik(found, passes=2) + sum(gain for gain, _ in found_lateral)
+        sizes = [size for _, size in found_lateral] or found.noise.disturbance[:2]
+        disturbance = np.concatenate([sizes, found.noise.disturbance[2:]])
         return value, replace(found, noise=replace(found.noise, disturbance=disturbance))
 
     first = fitted(1.0, point.noise, np.full(3, 0.1))
