@@ -76,7 +76,7 @@ class RowMaker:
         self._mix = matrix
 
     def restart(self) -> None:
-        """A flight begins: an onboard filter has no error yet."""
+        """The tests begin: the error of an onboard filter counts from 0; it settles within a second."""
         self._filter_error = np.zeros((2, 3))  # m, m/s, for a drag over mass of 1/s
 
     def rows(self, tape: Tape, p: Parameters, first: int, last: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

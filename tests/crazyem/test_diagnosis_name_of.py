@@ -133,9 +133,7 @@ def test_what_ruins_the_flights_held_out_explains_nothing_however_large():
     taken, ruin = trial("rotor_inertia", "i", 219.0), replace(trial("rate_damping", "xyz", 25.0), evidence=-21964.0)
     assert Step((taken, ruin), taken).explanations() == [taken]
     assert Step((taken, ruin), taken, alike=(ruin,)).explanations() == [taken, ruin]
-    both = replace(
-        ruin, gain=50.0, value=taken.value + 1.0
-    )  # fitted to all flights it explains more than the one taken
+    both = replace(ruin, gain=50.0, value=taken.value + 1.0)  # fitted to all flights it explains more
     assert Step((taken, both), taken).explanations() == [taken, both]
     other = replace(both, gain=0.02 * taken.gain)  # a wind of the held-out flight beside the gyro bias of both
     assert Step((taken, other), taken).explanations() == [taken]

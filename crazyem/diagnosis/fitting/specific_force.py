@@ -32,7 +32,8 @@ LATERAL = (0, 1)  # axes along which an onboard filter knows no force
 
 @dataclass(frozen=True)
 class ForceNoise:
-    """An ARMA process: its two coefficients, and the log-likelihood [nats] of the residuals that it was fitted to."""
+    """An ARMA(1, 1) process: the autoregressive coefficient `decay`, the moving-average coefficient `average`, and the
+    log-likelihood [nats] of the residuals that it was fitted to."""
 
     decay: float
     average: float

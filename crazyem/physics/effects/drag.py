@@ -25,8 +25,8 @@ def _of_real_rotors(names: str, size: float) -> Callable[[Conditions], Sizes]:
 SYSTEMATIC = in_turn("x y z", 3e-4, 3e-4, 1e-3)
 DETECTABLE = in_turn("x y z", 1e-3, 1e-3, 3e-3)  # N s/m, N s^2/m^2; along z, the thrust has a small error
 
-# Drag of rotors is proportional to their speed (Svacha et al. 2017), and the mean speed differs between flights: by 5 %
-# with 10 % of thrust.
+# Drag of rotors is proportional to their speed (Svacha et al. 2017). With 10 % of thrust, which flights are assumed to
+# differ by in the mean, that is 5 %. A drag that follows the speed is no effect of the catalogue.
 SPEED_SHARE = 0.05
 
 LINEAR_DRAG = Effect(
