@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.estimation import kernels
-from crazyem.estimation.inflation import innovation_noise, long_run, steady_gain, white_variance
+from crazyem.estimation.inflation import (
+    innovation_noise,
+    long_run,
+    steady_gain,
+    variance_with_bias,
+    white_variance,
+)
 from crazyem.estimation.inputs import InputHistory
 from crazyem.estimation.model import Noise, Parameters, Setup
 from crazyem.estimation.mstep import maximise
@@ -252,7 +258,7 @@ class WindowEM:
         if setup.free[4]:
             # squares are added: the parts are not known well enough to let them cancel
             bias[free] = np.sqrt(covariance**2 @ self.command_noise_score(first, last)[free] ** 2)
-        full += np.diag(bias**2)
+        np.fill_diagonal(full, variance_with_bias(np.diag(full), bias))
         return Information(matrix, full, step, decrement, factors, bias, noise_sd, noise_step)
 
     def _carried_information(self, first: int, last: int, of_noise: NDArray | None) -> NDArray:

@@ -13,12 +13,14 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
+from scipy.special import chndtrix, ndtri
 
 from crazyem.compiled import compiled
 from crazyem.physics.lag import CAUSAL, hold_predictor, lagged_means
 
 _DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])  # third difference: removes smooth parts, white variance times 20
 _STEPS, _BEGIN = 1000, 10  # rows of an impulse response, and row of the impulse
+FAR = 10.0  # standard deviations: a tail beyond is less than 1e-23
 
 
 def white_variance(command: NDArray, rate: NDArray, *, rate_variance: float) -> float:
@@ -84,6 +86,25 @@ def steady_gain(process: float, measurement: float) -> tuple[float, float]:
     predicted = 0.5 * (process + math.sqrt(process**2 + 4.0 * process * measurement))
     innovation = predicted + measurement
     return predicted / innovation, innovation
+
+
+def variance_with_bias(variance: NDArray, bias: NDArray) -> NDArray:
+    """Variance of the normal error whose central 95 % is as wide as the interval for `variance` and a possible bias.
+
+    A bias of known size and unknown sign is no second random error. The shortest interval about the estimate that holds
+    the truth in 95 % of all cases ends at a quantile of the folded normal distribution (Armstrong and Kolesar 2018).
+
+    Args:
+        variance: (n,) of the error without bias.
+        bias: (n,) largest bias, in the unit of the error.
+    """
+    out = np.array(variance)
+    biased = (bias != 0) & (out > 0)
+    ratio = np.abs(bias[biased]) / np.sqrt(out[biased])
+    # far from zero only one tail counts
+    quantile = np.where(ratio < FAR, np.sqrt(chndtrix(0.95, 1.0, np.minimum(ratio, FAR) ** 2)), ratio + ndtri(0.95))
+    out[biased] *= (quantile / ndtri(0.975)) ** 2
+    return out
 
 
 FEWEST_ROWS = 32  # with fewer rows, correlation in time cannot be estimated

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from crazyem.estimation.em import Information, WindowEM, offset
+from crazyem.estimation.inflation import variance_with_bias
 from crazyem.estimation.model import Noise, Parameters
 from crazyem.estimation.scoring import NOTHING_HELD, P, Point, log_posterior, log_prior, point
 
@@ -129,7 +130,8 @@ def combine(grids: list[list[Node]], information: Information, *, scales: tuple[
         weights = np.exp(weights - weights.max())
         weights /= weights.sum()
         means = np.array([node.shift for node in nodes])
-        sds = np.sqrt((np.array([node.sd for node in nodes]) * information.inflation) ** 2 + information.bias**2)
+        variances = (np.array([node.sd for node in nodes]) * information.inflation) ** 2
+        sds = np.sqrt(variance_with_bias(variances, np.broadcast_to(information.bias, variances.shape)))
         mean = weights @ means
         total = weights @ (sds**2 + (means - mean) ** 2)
         change = np.abs(total - plain**2)

@@ -4,8 +4,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import norm
 
-from crazyem.estimation.inflation import FEWEST_ROWS, innovation_noise, long_run, steady_gain, white_variance
+from crazyem.estimation.inflation import (
+    FAR,
+    FEWEST_ROWS,
+    innovation_noise,
+    long_run,
+    steady_gain,
+    variance_with_bias,
+    white_variance,
+)
 
 
 def bartlett(terms, lags):
@@ -105,3 +114,15 @@ def test_noise_of_commands_stays_in_the_innovations_until_measurements_correct_i
         out.append(x)
     found, _, _ = innovation_noise(period=period, tau=tau, gain=gain)
     assert found == pytest.approx(np.var(out[1000:]), rel=0.35)  # there joined by lines before the step
+
+
+@given(st.floats(0.1, 10.0), st.floats(-3.0 * FAR, 3.0 * FAR))
+def test_an_interval_holds_the_truth_in_95_percent_with_the_largest_bias_of_either_sign(sd, ratio):
+    variance = np.array([sd**2])
+    for bias in (ratio * sd, -ratio * sd):
+        half = norm.ppf(0.975) * np.sqrt(variance_with_bias(variance, np.array([bias])))[0]
+        assert norm.cdf((half - bias) / sd) - norm.cdf((-half - bias) / sd) == pytest.approx(0.95, abs=1e-9)
+
+
+def test_without_a_bias_or_a_random_error_a_variance_stays():
+    assert np.array_equal(variance_with_bias(np.array([4.0, 0.0]), np.array([0.0, 1.0])), [4.0, 0.0])
