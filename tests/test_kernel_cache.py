@@ -67,12 +67,15 @@ def test_no_function_can_be_taken_from_another_library(toy: Path) -> None:
 
 
 def test_processes_that_compile_at_once_leave_a_whole_cache(toy: Path, tmp_path: Path) -> None:
-    """What is compiled is counted, what is loaded is not; the numbers are the same alone, together, in either order."""
+    """What is compiled is counted, what is loaded is not; the numbers are the same alone, together, in either order.
+
+    On a busy machine one process may end before the other begins, which then loads everything.
+    """
     names = (("inner", "outer"), ("outer", "inner"))
     with ThreadPoolExecutor(2) as threads:
         found = list(threads.map(lambda both: run(toy, *both, cache=tmp_path), names))
     later = run(toy, "outer", cache=tmp_path)
-    assert all(int(one.pop("compiled")) >= 1 for one in found)
+    assert max(int(one.pop("compiled")) for one in found) >= 1
     assert later.pop("compiled") == "0"
     assert found[0] == found[1] == {**found[0], **later}
 

@@ -15,7 +15,7 @@ from crazyem.diagnosis.fitting.days import day_sd
 from crazyem.errors import DataError, UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.rotors import THRUST_SCALE, TRIM
-from crazyem.physics.effects.timing import DAILY_LAG_SD, MOTOR_LAG
+from crazyem.physics.effects.timing import LAG_SD, MOTOR_LAG
 from crazyem.physics.motion import vehicle_values
 from crazyem.simulators.constants import NUMBERS, from_vehicle
 from crazyem.simulators.findings import rescaled
@@ -24,7 +24,7 @@ from crazyem.vehicle import Posterior, Vehicle
 
 Array = NDArray[np.float64]
 MASS_SD = 0.02  # relative: other batteries, decks or markers that were not weighed
-USUAL_LAG = 0.05  # s, nominal lag for which `DAILY_LAG_SD` was found; their ratio is the sd of the lag's logarithm
+USUAL_LAG = 0.05  # s, nominal lag for which `LAG_SD` was found; their ratio is the sd of the lag's logarithm
 TRIES = 200  # most draws until a drone is physically possible
 
 
@@ -125,7 +125,7 @@ def _another_day(vehicle: Vehicle, rng: np.random.Generator) -> Vehicle:
         trim[axis] = trim.get(axis, 0.0) + sd * rng.standard_normal()
     lag = effects.get(MOTOR_LAG.name, {}).get("time_constant", vehicle.motor_time_constant)
     if lag > 0.0:
-        effects[MOTOR_LAG.name] = {"time_constant": lag * math.exp(DAILY_LAG_SD / USUAL_LAG * rng.standard_normal())}
+        effects[MOTOR_LAG.name] = {"time_constant": lag * math.exp(LAG_SD / USUAL_LAG * rng.standard_normal())}
     return replace(vehicle, effects=effects)
 
 

@@ -237,6 +237,17 @@ def test_neighbours_that_go_together_widen_errors() -> None:
     assert np.all(ratio < 2.1)
 
 
+@given(st.integers(0, 10_000), st.integers(2, 12), st.integers(1, 20))
+def test_rounding_does_not_change_errors(seed: int, blocks: int, columns: int) -> None:
+    """Also with fewer blocks than columns, where the scatter of the scores has no full rank."""
+    gram = simulated(seed, blocks=blocks, columns=columns, dispersion=4.0)
+    moved = Gram(gram.score * (1 + 1e-13), gram.information, gram.flight)
+    one, other = (g.solve(range(columns), precision=np.ones(columns), effective=True).covariance for g in (gram, moved))
+    sd = np.sqrt(np.diag(one))
+    np.testing.assert_allclose(one / np.outer(sd, sd), other / np.outer(sd, sd), atol=1e-6)
+    assert np.linalg.eigvalsh(one / np.outer(sd, sd)).min() > -1e-9
+
+
 def test_errors_are_never_smaller_than_the_information_allows() -> None:
     """Scores that scatter less than they should are luck."""
     quiet = simulated(9, dispersion=0.01)

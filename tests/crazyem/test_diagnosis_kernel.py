@@ -33,6 +33,11 @@ class Given:
     memory: Array
     p0: Array
 
+    @property
+    def coupled(self) -> bool:
+        """Whether position and velocity have errors with memory."""
+        return bool(self.disturbance[6] > 0 and self.disturbance[9] > 0)
+
 
 def made(
     seed: int, *, rows: int = 60, disturbed: bool = False, missing: float = 0.0, torques: bool = False,
@@ -74,15 +79,19 @@ def made(
     )  # fmt: skip
 
 
-def stepped(x: Array, dt: float, specific: Array, angular: Array, memory: Array) -> Array:
-    """States (..., 31) a step later: velocity by the attitude in the middle, position and attitude by mean rates."""
+def stepped(x: Array, dt: float, specific: Array, angular: Array, memory: Array, coupled: bool = False) -> Array:
+    """States (..., 31) a step later: velocity by the attitude in the middle, position and attitude by mean rates.
+
+    coupled: the error of the position integrates that of the velocity.
+    """
     turn = Rotation.from_quat(x[..., 6:10])
     middle = turn * Rotation.from_rotvec(x[..., 10:13] * dt / 2)
     v = x[..., 3:6] + dt * (middle.apply(specific + x[..., 13:16]) - [0, 0, G])
     w = x[..., 10:13] + dt * (angular + x[..., 16:19])
     end = (turn * Rotation.from_rotvec(dt * (x[..., 10:13] + w) / 2)).as_quat()
-    decay = np.exp(-dt / memory)
-    return np.concatenate([x[..., :3] + dt * (x[..., 3:6] + v) / 2, v, end, w, decay * x[..., 13:]], axis=-1)
+    lasting = np.exp(-dt / memory) * x[..., 13:]
+    lasting[..., 6:9] += dt * coupled * x[..., 22:25]
+    return np.concatenate([x[..., :3] + dt * (x[..., 3:6] + v) / 2, v, end, w, lasting], axis=-1)
 
 
 def plus(x: Array, error: Array) -> Array:
@@ -145,7 +154,7 @@ def plain(given: Given) -> Plain:
         dt = given.time[k] - given.time[k - 1]
 
         def move(state: Array, k: int = k, dt: float = dt) -> Array:
-            return stepped(state, dt, given.specific[k], given.angular[k], given.memory)
+            return stepped(state, dt, given.specific[k], given.angular[k], given.memory, given.coupled)
 
         end = move(x)
         width = 1e-6
@@ -222,7 +231,8 @@ def swept(
 @pytest.mark.parametrize(
     ("disturbed", "missing", "torques", "coloured"),
     [(False, 0.0, False, ()), (True, 0.0, False, ()), (True, 0.4, False, ()), (True, 0.2, True, ()),
-     (False, 0.2, False, (2,)), (True, 0.2, True, (0, 1, 2, 3)), (True, 0.2, False, (1, 3))],
+     (False, 0.2, False, (2,)), (True, 0.2, True, (0, 1, 2, 3)), (True, 0.2, False, (1, 3)),
+     (False, 0.2, False, (0, 1))],
 )  # fmt: skip
 def test_innovations_and_likelihood_are_those_of_a_plain_filter(
     disturbed: bool, missing: float, torques: bool, coloured: tuple[int, ...]
@@ -267,7 +277,9 @@ def displaced(given: Given, acting: Array, showing: Array, column: int, by: floa
     return replace(given, offset=given.offset + by * showing[:, :, column - acting.shape[2]])
 
 
-@pytest.mark.parametrize(("disturbed", "missing", "coloured"), [(False, 0.0, ()), (True, 0.3, ()), (True, 0.3, (0, 2))])
+@pytest.mark.parametrize(
+    ("disturbed", "missing", "coloured"), [(False, 0.0, ()), (True, 0.3, ()), (True, 0.3, (0, 2)), (True, 0.3, (0, 1))]
+)
 def test_score_and_information_are_differences_of_the_plain_filter(
     disturbed: bool, missing: float, coloured: tuple[int, ...]
 ) -> None:
@@ -372,7 +384,7 @@ def drawn(seed: int, rows: int, coloured: tuple[int, ...] = ()) -> Given:
                                 rng.normal(size=18) * np.sqrt(given.disturbance)])  # fmt: skip
         else:
             dt = given.time[k] - given.time[k - 1]
-            end = stepped(x, dt, given.specific[k], given.angular[k], given.memory)
+            end = stepped(x, dt, given.specific[k], given.angular[k], given.memory, given.coupled)
             spread = np.linalg.cholesky(process_noise(given, x, end, dt) + 1e-18 * np.eye(30))
             x = plus(end, spread @ rng.normal(size=30))
         noise = rng.normal(size=12) * np.sqrt(given.r)

@@ -47,7 +47,8 @@ def drawn(seed: int, noise: Noise, *, rows: int = 900, dt: float = 0.01) -> tupl
                 w = w + dw
             decay = np.exp(-dt / noise.memory)
             disturbance = decay * disturbance + np.sqrt(1 - decay**2) * noise.disturbance * rng.normal(size=6)
-            last = kept * last + np.sqrt(1 - kept**2) * lasting * other.normal(size=12)
+            before, last = last, kept * last + np.sqrt(1 - kept**2) * lasting * other.normal(size=12)
+            last[:3] += dt * before[3:6] * (noise.coloured[0] > 0)
         errors[k] = rng.normal(size=12) * sd + last
         y[k, :3], y[k, 3:6], y[k, 10:], turns[k] = p, v, w, turn
     y[:, :6] += errors[:, :6]
@@ -98,7 +99,8 @@ def test_coloured_errors_come_back_with_their_memory() -> None:
     there = replace(TRUE, coloured=2.0 * TRUE.measurement * [1, 1, 1, 0], recall=np.array([0.05, 0.1, 0.08, 1.0]))
     part = drawn(8, there)
     begun = coloured(replace(START, measurement=2.0 * TRUE.measurement), [part[0]])
-    assert not begun.coloured[[0, 1, 3]].any()  # an estimate of position and velocity; a gyro of shorter memory
+    assert begun.coloured[:3].all()
+    assert not begun.coloured[3]  # a gyro has a shorter memory
     found = fit_noise([part], replace(begun, coloured=begun.measurement * [1, 1, 1, 0]))
     np.testing.assert_allclose(found.coloured[:3], there.coloured[:3], rtol=0.25)
     assert np.all(np.abs(np.log(found.recall / there.recall))[:3] < np.log(1.5))

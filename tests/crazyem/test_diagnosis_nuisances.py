@@ -25,7 +25,8 @@ from crazyem.diagnosis.fitting.nuisances import (
 from crazyem.diagnosis.flights.flight import _blocks, flight_of
 from crazyem.diagnosis.naming.detection_limits import exceeds_limit
 from crazyem.physics.effects.catalogue import CATALOGUE
-from crazyem.physics.effects.prior import AT_ONCE_SD
+from crazyem.physics.effects.prior import AT_ONCE_SD, Conditions
+from crazyem.physics.effects.timing import LAG_SD
 
 POINT = Point(DRONE, {}, start_noise())
 
@@ -228,3 +229,21 @@ def test_a_second_look_that_diverges_takes_nothing_away(monkeypatch):
     assert found.loglik == 3.0
     assert settled == [POINT]
     assert looks == []
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.4])
+def test_the_lag_is_as_uncertain_as_commands_between_the_logged_ones_make_the_torque(share):
+    """Oracle: the lag as a filter, at the frequency of one over the lag, by a difference."""
+    lag = 0.05
+    sd = CATALOGUE["motor_lag"].prior.usual_in(Conditions(lag=lag, unlogged_share=share))["time_constant"]
+    assert sd >= LAG_SD
+    step = 1e-4 * lag
+    torque = [1.0 / np.hypot(1.0, (lag + s * step) / lag) for s in (-1, 1)]
+    by_lag = (torque[0] - torque[1]) / (np.mean(torque) * 2 * step)
+    assert by_lag * np.sqrt(sd**2 - LAG_SD**2) == pytest.approx(share, rel=1e-5)
+
+
+def test_a_file_of_one_drone_has_no_other_prior_of_the_lag():
+    conditions = Conditions(signals=frozenset({"body_rate"}), unlogged_share=0.2)
+    prior = CATALOGUE["motor_lag"].prior
+    assert prior.usual_in(conditions) == prior.usual_in(replace(conditions, file_effects=frozenset({"trim"})))

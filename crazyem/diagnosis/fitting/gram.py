@@ -132,12 +132,10 @@ class Gram:
         blocks, k = residual.shape
         residual = residual - residual.mean(0)
         meat = residual.T @ residual * blocks / max(blocks - 1, 1)
-        # neighbours are correlated: half of their covariance is added (Newey and West 1987, one lag)
-        if blocks > 4:
-            lagged = residual[1:].T @ residual[:-1]
-            both = meat + 0.5 * (lagged + lagged.T)
-            if np.all(np.linalg.eigvalsh(both) > 0.3 * np.linalg.eigvalsh(meat).min()):
-                meat = both
+        # neighbours are correlated: half of their covariance is added (Newey and West 1987, one lag), which leaves it
+        # positive semidefinite
+        lagged = residual[1:].T @ residual[:-1]
+        meat += 0.5 * (lagged + lagged.T)
         inverse = _inverse(a)
         freedom = max(blocks - (used(infos.sum(0), a) if effective else k), 2)
         sandwich = inverse @ meat @ inverse * blocks / freedom

@@ -2,7 +2,8 @@
 
 The states of the extended Kalman filter are position, velocity, attitude and body rate. Optional states are two
 disturbances (specific force and angular acceleration, body axes) and errors of measurements (Bryson and Henrikson
-1968), all with memory (Ornstein-Uhlenbeck). Inputs are the specific force and angular acceleration of each step.
+1968), all with memory (Ornstein-Uhlenbeck). Position and velocity of one estimate err together: the error of the
+position also integrates that of the velocity. Inputs are the specific force and angular acceleration of each step.
 `physics.motion` computes them beforehand at the states of the filter, so the kernel contains no parameter.
 
 A column is a change of the accelerations or of the measurements. The kernel propagates the derivative of the state by
@@ -31,11 +32,12 @@ PRODUCT, MOST_ROWS = 200_000, 600
 
 
 @compiled
-def _transition(dt, pushed, decay, turned, rate_turn, middle, specific, jr, x, out):
+def _transition(dt, pushed, coupled, decay, turned, rate_turn, middle, specific, jr, x, out):
     """out = Phi x for x (size, m): error states of one step by the midpoint rule.
 
-    pushed: 12 plus the number of disturbance states; decay: factors of all states after the first 12; turned (3, 3):
-    -dt middle skew(specific), by the attitude at the start; rate_turn (3, 3): transposed rotation of the step.
+    pushed: 12 plus the number of disturbance states; coupled: whether errors of position and velocity follow these,
+    the first the integral of the second; decay: factors of all states after the first 12; turned (3, 3): -dt middle
+    skew(specific), by the attitude at the start; rate_turn (3, 3): transposed rotation of the step.
     """
     h = 0.5 * dt
     size = x.shape[0]
@@ -74,6 +76,9 @@ def _transition(dt, pushed, decay, turned, rate_turn, middle, specific, jr, x, o
         out[11, j] = w2 + dt * a2
         for i in range(12, size):
             out[i, j] = decay[i - 12] * x[i, j]
+        if coupled:
+            for i in range(pushed, pushed + 3):
+                out[i, j] += dt * x[3 + i, j]
 
 
 @compiled
@@ -167,6 +172,7 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
     size, pushed = 12 + len(which), 12
     while pushed < size and which[pushed - 12] < DISTURBED:
         pushed += 1
+    coupled = own[0] > 0 and own[3] > 0
     decay = np.empty(size - 12)
     wide, broad = _padded(size), _padded(m)
     rows = max(MEASURED, min(MOST_ROWS, PRODUCT // (broad * broad)))
@@ -263,6 +269,9 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
             x[i] = 0.0
         for i in range(size - 12):
             x[13 + which[i]] = decay[i] * xf[k - 1, 13 + which[i]]
+        if coupled:
+            for i in range(3):
+                x[19 + i] += dt * xf[k - 1, 22 + i]
         # derivative of velocity by attitude (at the start) and by body rate (through the middle)
         for i in range(3):
             m0, m1, m2 = middle[i, 0], middle[i, 1], middle[i, 2]
@@ -277,13 +286,13 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
             for j in range(3):
                 rate_turn[i, j] = turn[j, i]
         right_jacobian(phi, jr)
-        _transition(dt, pushed, decay, turned, rate_turn, middle, by_rate, jr, cov, tmp)
+        _transition(dt, pushed, coupled, decay, turned, rate_turn, middle, by_rate, jr, cov, tmp)
         for i in range(size):
             for j in range(size):
                 tra[i, j] = tmp[j, i]
-        _transition(dt, pushed, decay, turned, rate_turn, middle, by_rate, jr, tra, cov)
+        _transition(dt, pushed, coupled, decay, turned, rate_turn, middle, by_rate, jr, tra, cov)
         if len(steps):
-            _transition(dt, pushed, decay, turned, rate_turn, middle, by_rate, jr, unit, steps[k])
+            _transition(dt, pushed, coupled, decay, turned, rate_turn, middle, by_rate, jr, unit, steps[k])
             for i in range(3):
                 for j in range(3):
                     steps[k, size + i, j] = middle[i, j]
@@ -310,7 +319,7 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
         for i in range(size - 12):
             cov[12 + i, 12 + i] += (1.0 - decay[i] * decay[i]) * disturbance[which[i]]
         if m:
-            _transition(dt, pushed, decay, turned, rate_turn, middle, by_rate, jr, sens, new)
+            _transition(dt, pushed, coupled, decay, turned, rate_turn, middle, by_rate, jr, sens, new)
             for j in range(c):
                 f0, f1, f2 = acting[k, 0, j], acting[k, 1, j], acting[k, 2, j]
                 a0, a1, a2 = acting[k, 3, j], acting[k, 4, j], acting[k, 5, j]

@@ -50,13 +50,11 @@ def noise_of(logs: NDArray, memory: float | NDArray) -> Noise:
 def coloured(noise: Noise, flights: Sequence[Flight]) -> Noise:
     """The noise with as much coloured as white error, for quantities that are sampled fast enough to show it.
 
-    If both position and velocity are measured, neither gets a coloured error. They come from one filter, whose errors
-    in the two are correlated with each other and with the motion; independent errors would look like a wrong scale of
-    the velocity.
+    If both position and velocity get one, they come from one estimate, and the error of the position integrates that of
+    the velocity (`kernel.py`).
     """
     periods = np.array([_period(flights, c) for c in FIRST])
     lasting = periods < NOISE.white_period * RECALL
-    lasting[:2] &= not np.isfinite(periods[:2]).all()
     return replace(noise, coloured=np.where(lasting, noise.measurement, 0.0), recall=RECALL.copy())
 
 
@@ -64,7 +62,9 @@ def without_negligible(noise: Noise, flights: Sequence[Flight]) -> Noise:
     """The noise without coloured errors that are negligible at all frequencies: each costs time in every pass."""
     periods = np.array([_period(flights, c) for c in FIRST])
     density = noise.coloured * np.sqrt(1.0 + 2.0 * noise.recall / periods)
-    return replace(noise, coloured=np.where(density < NOISE.min_coloured * noise.measurement, 0.0, noise.coloured))
+    kept = density >= NOISE.min_coloured * noise.measurement
+    kept[0] |= kept[1]  # the error of the position integrates that of the velocity
+    return replace(noise, coloured=np.where(kept, noise.coloured, 0.0))
 
 
 def _period(flights: Sequence[Flight], column: int) -> float:
