@@ -20,7 +20,7 @@ from crazyem.physics.lag import CAUSAL, hold_predictor, lagged_means
 
 _DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])  # third difference: removes smooth parts, white variance times 20
 _STEPS, _BEGIN = 1000, 10  # rows of an impulse response, and row of the impulse
-FAR = 10.0  # standard deviations: a tail beyond is less than 1e-23
+LARGE_BIAS = 10.0  # standard deviations, beyond which the other tail is less than 1e-23
 
 
 def white_variance(command: NDArray, rate: NDArray, *, rate_variance: float) -> float:
@@ -102,7 +102,9 @@ def variance_with_bias(variance: NDArray, bias: NDArray) -> NDArray:
     biased = (bias != 0) & (out > 0)
     ratio = np.abs(bias[biased]) / np.sqrt(out[biased])
     # far from zero only one tail counts
-    quantile = np.where(ratio < FAR, np.sqrt(chndtrix(0.95, 1.0, np.minimum(ratio, FAR) ** 2)), ratio + ndtri(0.95))
+    quantile = np.where(
+        ratio < LARGE_BIAS, np.sqrt(chndtrix(0.95, 1.0, np.minimum(ratio, LARGE_BIAS) ** 2)), ratio + ndtri(0.95)
+    )
     out[biased] *= (quantile / ndtri(0.975)) ** 2
     return out
 

@@ -105,6 +105,9 @@ def test_coloured_errors_come_back_with_their_memory() -> None:
     np.testing.assert_allclose(found.coloured[:3], there.coloured[:3], rtol=0.25)
     assert np.all(np.abs(np.log(found.recall / there.recall))[:3] < np.log(1.5))
     np.testing.assert_allclose(found.measurement, TRUE.measurement, rtol=0.25)
+    faint = replace(there, coloured=there.coloured * [1e-6, 1, 1e-6, 0])
+    kept = without_negligible(faint, [part[0]]).coloured > 0
+    assert kept.tolist() == [True, True, False, False]  # a position errs with its velocity
     white = without_negligible(fit_noise([drawn(1, TRUE)], coloured(TRUE, [part[0]])), [part[0]])
     assert not white.coloured.any()
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 
 from crazyem.estimation.inflation import (
-    FAR,
     FEWEST_ROWS,
+    LARGE_BIAS,
     innovation_noise,
     long_run,
     steady_gain,
@@ -116,7 +116,7 @@ def test_noise_of_commands_stays_in_the_innovations_until_measurements_correct_i
     assert found == pytest.approx(np.var(out[1000:]), rel=0.35)  # there joined by lines before the step
 
 
-@given(st.floats(0.1, 10.0), st.floats(-3.0 * FAR, 3.0 * FAR))
+@given(st.floats(0.1, 10.0), st.floats(-3.0 * LARGE_BIAS, 3.0 * LARGE_BIAS))
 def test_an_interval_holds_the_truth_in_95_percent_with_the_largest_bias_of_either_sign(sd, ratio):
     variance = np.array([sd**2])
     for bias in (ratio * sd, -ratio * sd):
