@@ -57,7 +57,7 @@ def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_as
     assert [(e.name, e.confidence) for e in found.effects] == [("inertia", pytest.approx(0.623))]
     (taken,) = [step.taken for step in found.selection.steps if step.taken]
     assert brought == [taken.held_out / taken.dispersion] != [0.0]  # what is weighed against what is left
-    assert found.unexplained.gained == pytest.approx((taken.gain) / taken.dispersion - 3)
+    assert found.unexplained.gained == pytest.approx(taken.gain / taken.dispersion - 3)
     assert found.indistinguishable == (("inertia", "torque_scale"),)
 
 
