@@ -32,6 +32,7 @@ class Given:
     disturbance: Array
     memory: Array
     p0: Array
+    thrust_only: bool = False
 
     @property
     def coupled(self) -> bool:
@@ -79,10 +80,19 @@ def made(
     )  # fmt: skip
 
 
-def stepped(x: Array, dt: float, specific: Array, angular: Array, memory: Array, coupled: bool = False) -> Array:
+def stepped(
+    x: Array,
+    dt: float,
+    specific: Array,
+    angular: Array,
+    memory: Array,
+    coupled: bool = False,
+    thrust_only: bool = False,
+) -> Array:
     """States (..., 31) a step later: velocity by the attitude in the middle, position and attitude by mean rates.
 
     coupled: the error of the position integrates that of the velocity.
+    thrust_only: of an estimate by thrust and attitude.
     """
     turn = Rotation.from_quat(x[..., 6:10])
     middle = turn * Rotation.from_rotvec(x[..., 10:13] * dt / 2)
@@ -90,7 +100,10 @@ def stepped(x: Array, dt: float, specific: Array, angular: Array, memory: Array,
     w = x[..., 10:13] + dt * (angular + x[..., 16:19])
     end = (turn * Rotation.from_rotvec(dt * (x[..., 10:13] + w) / 2)).as_quat()
     lasting = np.exp(-dt / memory) * x[..., 13:]
-    lasting[..., 6:9] += dt * coupled * x[..., 22:25]
+    turned = np.cross(x[..., 25:28], specific + x[..., 13:16])  # thrust, by the error of the attitude
+    unknown = dt * thrust_only * coupled * middle.apply(turned - x[..., 13:16] * [1, 1, 0])
+    lasting[..., 6:9] += dt * coupled * x[..., 22:25] + dt / 2 * unknown
+    lasting[..., 9:12] += unknown
     return np.concatenate([x[..., :3] + dt * (x[..., 3:6] + v) / 2, v, end, w, lasting], axis=-1)
 
 
@@ -118,6 +131,8 @@ def process_noise(given: Given, x: Array, end: Array, dt: float) -> Array:
         g = np.zeros((30, 6))
         g[0:3, 0:3], g[3:6, 0:3] = left * middle, middle
         g[6:9, 3:6], g[9:12, 3:6] = left * jacobian, np.eye(3)
+        if given.coupled and given.thrust_only:
+            g[18:24, :2] = -g[:6, :2]
         total += 0.5 * dt * weight * g @ np.diag(given.q) @ g.T
     total[12:, 12:] += np.diag((1 - np.exp(-2 * dt / given.memory)) * given.disturbance)
     return total
@@ -125,17 +140,19 @@ def process_noise(given: Given, x: Array, end: Array, dt: float) -> Array:
 
 @dataclass(frozen=True)
 class Plain:
-    """(n, 12) innovations made sequential and their variances; (n, 19) filtered states; the log-likelihood."""
+    """(n, 12) innovations made sequential and their variances; (n, 19) filtered states; the log-likelihood; by row the
+    gain and the Cholesky factor of the innovations' covariance."""
 
     e: Array
     s: Array
     filtered: Array
     loglik: float
+    gains: dict[int, tuple[Array, Array]]
 
 
-def plain(given: Given) -> Plain:
-    """An extended Kalman filter as it stands in textbooks."""
-    n = len(given.time)
+def plain(given: Given, gains: dict[int, tuple[Array, Array]] | None = None) -> Plain:
+    """An extended Kalman filter as it stands in textbooks; with the gains of another run, if given."""
+    n, used = len(given.time), {}
     e, s, filtered, loglik = np.zeros((n, 12)), np.zeros((n, 12)), np.zeros((n, 31)), 0.0
     x, p = np.zeros(31), np.zeros((30, 30))
     for k in range(n):
@@ -154,7 +171,9 @@ def plain(given: Given) -> Plain:
         dt = given.time[k] - given.time[k - 1]
 
         def move(state: Array, k: int = k, dt: float = dt) -> Array:
-            return stepped(state, dt, given.specific[k], given.angular[k], given.memory, given.coupled)
+            return stepped(
+                state, dt, given.specific[k], given.angular[k], given.memory, given.coupled, given.thrust_only
+            )
 
         end = move(x)
         width = 1e-6
@@ -171,16 +190,16 @@ def plain(given: Given) -> Plain:
         innovation = (minus(y, x)[:12] - given.offset[k] - x[19:])[known]
         h = (np.eye(12, 30) + np.eye(12, 30, 18))[known]
         joint = h @ p @ h.T + np.diag(given.r[known])
-        lower = np.linalg.cholesky(joint)
+        gain, lower = (gains or {}).get(k) or (p @ h.T @ np.linalg.inv(joint), np.linalg.cholesky(joint))
+        used[k] = gain, lower
         e[k, known] = np.linalg.solve(lower, innovation) * np.diag(lower)
         s[k, known] = np.diag(lower) ** 2
         loglik -= 0.5 * float(innovation @ np.linalg.solve(joint, innovation) + np.linalg.slogdet(2 * np.pi * joint)[1])
-        gain = p @ h.T @ np.linalg.inv(joint)
         x = plus(x, gain @ innovation)
         p = (np.eye(30) - gain @ h) @ p
         p = 0.5 * (p + p.T)
         filtered[k] = x
-    return Plain(e, s, filtered, loglik)
+    return Plain(e, s, filtered, loglik, used)
 
 
 def begun(y: Array, offset: Array) -> Array:
@@ -222,23 +241,27 @@ def swept(
     rows, score, information = np.zeros(n), np.zeros((blocks, m)), np.zeros((blocks, m, m))
     loglik = sweep(
         given.time, given.starts, given.y, given.specific, given.angular, given.offset, acting, showing, given.q,
-        given.r, given.disturbance, given.memory, given.p0, block, predicted, filtered, e, s, rows, score, information,
+        given.r, given.disturbance, given.memory, given.p0, block, int(given.thrust_only), predicted, filtered, e, s,
+        rows, score, information,
         np.zeros((0, 12, 12)), np.zeros((0, 18, 12)), np.zeros((0, 0, 12)),
     )  # fmt: skip
     return Result(filtered, e, s, rows, loglik, score, information)
 
 
+@pytest.mark.parametrize("thrust_only", [False, True])
 @pytest.mark.parametrize(
     ("disturbed", "missing", "torques", "coloured"),
     [(False, 0.0, False, ()), (True, 0.0, False, ()), (True, 0.4, False, ()), (True, 0.2, True, ()),
      (False, 0.2, False, (2,)), (True, 0.2, True, (0, 1, 2, 3)), (True, 0.2, False, (1, 3)),
-     (False, 0.2, False, (0, 1))],
+     (False, 0.2, False, (0, 1)), (False, 0.2, False, (0, 1, 2))],
 )  # fmt: skip
 def test_innovations_and_likelihood_are_those_of_a_plain_filter(
-    disturbed: bool, missing: float, torques: bool, coloured: tuple[int, ...]
+    disturbed: bool, missing: float, torques: bool, coloured: tuple[int, ...], thrust_only: bool
 ) -> None:
     """To a thousandth of a standard deviation: how the attitude in the middle turns with the rate is first order."""
-    given = made(1, disturbed=disturbed, missing=missing, torques=torques, coloured=coloured)
+    given = replace(
+        made(1, disturbed=disturbed, missing=missing, torques=torques, coloured=coloured), thrust_only=thrust_only
+    )
     slow, fast = plain(given), swept(given)
     seen = slow.s > 0
     assert np.array_equal(fast.s > 0, seen)
@@ -278,16 +301,18 @@ def displaced(given: Given, acting: Array, showing: Array, column: int, by: floa
 
 
 @pytest.mark.parametrize(
-    ("disturbed", "missing", "coloured"), [(False, 0.0, ()), (True, 0.3, ()), (True, 0.3, (0, 2)), (True, 0.3, (0, 1))]
-)
+    ("disturbed", "missing", "coloured", "thrust_only"),
+    [(False, 0.0, (), False), (True, 0.3, (), False), (True, 0.3, (0, 2), False), (True, 0.3, (0, 1), False),
+     (True, 0.3, (0, 1, 2), True)],
+)  # fmt: skip
 def test_score_and_information_are_differences_of_the_plain_filter(
-    disturbed: bool, missing: float, coloured: tuple[int, ...]
+    disturbed: bool, missing: float, coloured: tuple[int, ...], thrust_only: bool
 ) -> None:
-    """Scores within 0.02 standard deviations, information within 1 %.
+    """Scores within 0.02 standard deviations, information within 1 %, with the same gains.
 
-    Of an attitude that is shown turned, within 0.1: it turns the filter's gains and variances too, which is left out.
+    Scores of an attitude that is shown turned, within 0.1: it turns axes of errors and gains, too, which is left out.
     """
-    given = made(2, disturbed=disturbed, missing=missing, coloured=coloured)
+    given = replace(made(2, disturbed=disturbed, missing=missing, coloured=coloured), thrust_only=thrust_only)
     acting, showing = columns_of(given)
     block = (np.arange(len(given.time)) // 15).astype(np.int64)
     found = swept(given, acting, showing, block)
@@ -299,6 +324,7 @@ def test_score_and_information_are_differences_of_the_plain_filter(
         up = plain(displaced(given, acting, showing, column, width))
         down = plain(displaced(given, acting, showing, column, -width))
         likelihoods.append((up.loglik - down.loglik) / (2 * width))
+        up, down = (plain(displaced(given, acting, showing, column, by), here.gains) for by in (width, -width))
         slopes.append(-(up.e - down.e) / (2 * width) / sd)
     slope = np.stack(slopes)  # (4, n, 12)
     whole = np.einsum("akc,bkc->ab", slope, slope)
@@ -362,10 +388,10 @@ def test_a_row_without_a_measurement_only_predicts() -> None:
     assert np.max(np.abs(minus(found.filtered[10], expected))) < 1e-12
 
 
-@pytest.mark.parametrize("coloured", [(), (0, 1, 2, 3)])
-def test_white_innovations_where_model_and_noise_are_true(coloured: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(("coloured", "thrust_only"), [((), False), ((0, 1, 2, 3), False), ((0, 1, 2), True)])
+def test_white_innovations_where_model_and_noise_are_true(coloured: tuple[int, ...], thrust_only: bool) -> None:
     """On data drawn from the model itself, squared standardised innovations sum to a chi-squared number (5 sigma)."""
-    given = drawn(6, rows=400, coloured=coloured)
+    given = drawn(6, rows=400, coloured=coloured, thrust_only=thrust_only)
     found = swept(given)
     seen = found.s > 0
     z = found.e[seen] / np.sqrt(found.s[seen])
@@ -373,9 +399,15 @@ def test_white_innovations_where_model_and_noise_are_true(coloured: tuple[int, .
     assert abs(z.mean()) < 5 / np.sqrt(z.size)
 
 
-def drawn(seed: int, rows: int, coloured: tuple[int, ...] = ()) -> Given:
+@pytest.mark.parametrize("thrust_only", [False, True])
+def test_the_likelihood_tells_whether_an_estimate_knows_lateral_forces(thrust_only: bool) -> None:
+    given = drawn(7, rows=400, coloured=(0, 1, 2), thrust_only=thrust_only)
+    assert swept(given).loglik > swept(replace(given, thrust_only=not thrust_only)).loglik + 10.0
+
+
+def drawn(seed: int, rows: int, coloured: tuple[int, ...] = (), thrust_only: bool = False) -> Given:
     """Impulses, measurement noise, disturbances and errors with memory drawn with the given variances; 2 stretches."""
-    given = made(seed, rows=rows, disturbed=True, coloured=coloured)
+    given = replace(made(seed, rows=rows, disturbed=True, coloured=coloured), thrust_only=thrust_only)
     rng = np.random.default_rng(seed)
     y, x = given.y.copy(), np.zeros(31)
     for k in range(rows):
@@ -384,7 +416,7 @@ def drawn(seed: int, rows: int, coloured: tuple[int, ...] = ()) -> Given:
                                 rng.normal(size=18) * np.sqrt(given.disturbance)])  # fmt: skip
         else:
             dt = given.time[k] - given.time[k - 1]
-            end = stepped(x, dt, given.specific[k], given.angular[k], given.memory, given.coupled)
+            end = stepped(x, dt, given.specific[k], given.angular[k], given.memory, given.coupled, given.thrust_only)
             spread = np.linalg.cholesky(process_noise(given, x, end, dt) + 1e-18 * np.eye(30))
             x = plus(end, spread @ rng.normal(size=30))
         noise = rng.normal(size=12) * np.sqrt(given.r)

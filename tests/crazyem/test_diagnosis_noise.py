@@ -140,23 +140,26 @@ def test_long_flights_are_judged_by_stretches_all_over() -> None:
 
 
 def test_logarithms_and_back() -> None:
-    again = noise_of(logs_of(TRUE), TRUE.memory)
+    again = noise_of(logs_of(TRUE), TRUE)
     np.testing.assert_allclose(again.impulse, TRUE.impulse)
     np.testing.assert_allclose(again.measurement, TRUE.measurement)
     assert not again.disturbance.any()
 
 
 @pytest.mark.parametrize(
-    ("memories", "lasting"),
-    [((), ()), ((3, 4, 5), ()), ((0, 1, 2, 3, 4, 5), ()), ((), (2,)), ((3, 4, 5), (0, 1, 2, 3)), ((0, 1, 2), (1, 3))],
-)
-def test_the_score_is_the_slope_of_the_likelihood(memories: tuple[int, ...], lasting: tuple[int, ...]) -> None:
+    ("memories", "lasting", "onboard"),
+    [((), (), False), ((3, 4, 5), (), False), ((0, 1, 2, 3, 4, 5), (), False), ((), (2,), False),
+     ((3, 4, 5), (0, 1, 2, 3), False), ((0, 1, 2), (1, 3), True), ((0, 1, 2, 3, 4, 5), (0, 1, 2), True)],
+)  # fmt: skip
+def test_the_score_is_the_slope_of_the_likelihood(
+    memories: tuple[int, ...], lasting: tuple[int, ...], onboard: bool
+) -> None:
     """By central differences; measurements missing and starts within. The filter is linear but for its attitude."""
     flight, acceleration, offset = drawn(7, TRUE, rows=300)
     y, starts = flight.y.copy(), flight.starts.copy()
     y[::3, 6:10], y[1::4, 3:6] = np.nan, np.nan
     starts[[100, 101, 200]] = True
-    flight = replace(flight, y=y, starts=starts)
+    flight = replace(flight, y=y, starts=starts, fused=onboard)
     disturbance = np.where(np.isin(np.arange(6), memories), [0.1, 0.1, 0.2, 1.0, 2.0, 0.5], 0.0)
     errors = np.where(np.isin(np.arange(4), lasting), 1.5 * TRUE.measurement, 0.0)
     recall = np.array([0.03, 0.1, 0.05, 0.01])
@@ -165,7 +168,9 @@ def test_the_score_is_the_slope_of_the_likelihood(memories: tuple[int, ...], las
     nothing = np.zeros((300, 6, 0)), np.zeros((300, 12, 0))
     for i in np.flatnonzero(np.isfinite(logs_of(noise))):
         up, down = (
-            run_sweep(flight, acceleration, offset, *nothing, noise_of(logs_of(noise) + d * np.eye(24)[i], 0.3)).loglik
+            run_sweep(
+                flight, acceleration, offset, *nothing, noise_of(logs_of(noise) + d * np.eye(24)[i], noise)
+            ).loglik
             for d in (1e-4, -1e-4)
         )
         assert score[i] == pytest.approx((up - down) / 2e-4, rel=2e-3, abs=0.05)

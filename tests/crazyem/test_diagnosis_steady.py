@@ -247,7 +247,7 @@ def test_noise_under_which_a_variance_is_none_is_not_likely(monkeypatch) -> None
 
     def lost(*arrays: Any) -> float:
         value = kernel(*arrays)
-        arrays[17][3, 0] = -1e299  # a variance
+        arrays[18][3, 0] = -1e299  # a variance
         return float(value) + 1e6  # as likely as it then seems
 
     monkeypatch.setattr(sweeps, "sweep", lost)

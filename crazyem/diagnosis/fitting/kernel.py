@@ -14,6 +14,7 @@ depend on earlier motion only. So the control loop causes no bias (Ljung, System
 import numpy as np
 
 from crazyem.compiled import compiled
+from crazyem.diagnosis.fitting.transition import transition, unknown_force
 from crazyem.estimation.kernels.algebra import half_turn, log, matrix, product, right_jacobian
 from crazyem.vehicle import GRAVITY
 
@@ -29,56 +30,6 @@ LANES, SHORTEST_ROW = 4, 16
 # Limits of the number of measurements whose products are added by one product of matrices; with more, BLAS would use
 # several threads.
 PRODUCT, MOST_ROWS = 200_000, 600
-
-
-@compiled
-def _transition(dt, pushed, coupled, decay, turned, rate_turn, middle, specific, jr, x, out):
-    """out = Phi x for x (size, m): error states of one step by the midpoint rule.
-
-    pushed: 12 plus the number of disturbance states; coupled: whether errors of position and velocity follow these,
-    the first the integral of the second; decay: factors of all states after the first 12; turned (3, 3): -dt middle
-    skew(specific), by the attitude at the start; rate_turn (3, 3): transposed rotation of the step.
-    """
-    h = 0.5 * dt
-    size = x.shape[0]
-    f0 = f1 = f2 = a0 = a1 = a2 = 0.0
-    for j in range(x.shape[1]):
-        t0, t1, t2 = x[6, j], x[7, j], x[8, j]
-        w0, w1, w2 = x[9, j], x[10, j], x[11, j]
-        if pushed > 12:
-            a0, a1, a2 = x[12, j], x[13, j], x[14, j]
-        if pushed > 15:
-            f0, f1, f2 = x[15, j], x[16, j], x[17, j]
-        # attitude in the middle of the step, by the half turn
-        for i in range(3):
-            v = (
-                x[3 + i, j]
-                + turned[i, 0] * t0
-                + turned[i, 1] * t1
-                + turned[i, 2] * t2
-                + h * (specific[i, 0] * w0 + specific[i, 1] * w1 + specific[i, 2] * w2)
-                + dt * (middle[i, 0] * f0 + middle[i, 1] * f1 + middle[i, 2] * f2)
-            )
-            out[i, j] = x[i, j] + h * (x[3 + i, j] + v)
-            out[3 + i, j] = v
-        b0, b1, b2 = dt * w0 + h * dt * a0, dt * w1 + h * dt * a1, dt * w2 + h * dt * a2
-        for i in range(3):
-            out[6 + i, j] = (
-                rate_turn[i, 0] * t0
-                + rate_turn[i, 1] * t1
-                + rate_turn[i, 2] * t2
-                + jr[i, 0] * b0
-                + jr[i, 1] * b1
-                + jr[i, 2] * b2
-            )
-        out[9, j] = w0 + dt * a0
-        out[10, j] = w1 + dt * a1
-        out[11, j] = w2 + dt * a2
-        for i in range(12, size):
-            out[i, j] = decay[i - 12] * x[i, j]
-        if coupled:
-            for i in range(pushed, pushed + 3):
-                out[i, j] += dt * x[3 + i, j]
 
 
 @compiled
@@ -138,7 +89,7 @@ def _add_products(shown, total):
 
 @compiled
 def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, disturbance, memory, p0, block,
-          xp, xf, e, s, loglik, score, information, gains, steps, known):  # fmt: skip
+          thrust_only, xp, xf, e, s, loglik, score, information, gains, steps, known):  # fmt: skip
     """One pass of the filter; returns the log-likelihood.
 
     Args:
@@ -156,6 +107,9 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
         memory: (18,) s, their correlation times.
         p0: (12,) variances at a start of states that are not measured there.
         block: (n,) int, the block of `score` and `information` of each row.
+        thrust_only: 1 if the measured position and velocity are of an estimate by attitude and thrust alone: at first
+            they lack what impulses and disturbances along body x and y change, and an error of the attitude turns the
+            thrust; else 0.
         xp, xf: (n, 31) receive predicted and filtered state (13), disturbances (6) and errors with memory (12).
         e, s: (n, 12) receive innovations and their variances, sequential scalars; s is 0 where nothing was measured.
         loglik: (n,) receives log-likelihoods.
@@ -173,6 +127,7 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
     while pushed < size and which[pushed - 12] < DISTURBED:
         pushed += 1
     coupled = own[0] > 0 and own[3] > 0
+    tilt = own[6] if coupled and thrust_only else 0
     decay = np.empty(size - 12)
     wide, broad = _padded(size), _padded(m)
     rows = max(MEASURED, min(MOST_ROWS, PRODUCT // (broad * broad)))
@@ -191,6 +146,8 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
     turned = np.empty((3, 3))
     by_rate = np.empty((3, 3))
     rate_turn = np.empty((3, 3))
+    unknown = np.zeros((3, 12))
+    u = np.empty(3)
     jr = np.empty((3, 3))
     phi = np.empty(3)
     unit = np.eye(size)
@@ -281,18 +238,26 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
         for i in range(3):  # a rotation at the start, seen in the middle: -dt middle skew(f) turn'
             for j in range(3):
                 turned[i, j] = by_rate[i, 0] * turn[j, 0] + by_rate[i, 1] * turn[j, 1] + by_rate[i, 2] * turn[j, 2]
+        if coupled and thrust_only:
+            unknown_force(dt, tilt, xf[k - 1], f, middle, turn, by_rate, unknown, u)
+            for i in range(3):
+                v = dt * (middle[i, 0] * u[0] + middle[i, 1] * u[1] + middle[i, 2] * u[2])
+                x[19 + i] += h * v
+                x[22 + i] += v
         matrix(quat, turn)
         for i in range(3):
             for j in range(3):
                 rate_turn[i, j] = turn[j, i]
         right_jacobian(phi, jr)
-        _transition(dt, pushed, coupled, decay, turned, rate_turn, middle, by_rate, jr, cov, tmp)
+        transition(dt, pushed, coupled, tilt, decay, turned, rate_turn, middle, by_rate, unknown, jr, cov, tmp)
         for i in range(size):
             for j in range(size):
                 tra[i, j] = tmp[j, i]
-        _transition(dt, pushed, coupled, decay, turned, rate_turn, middle, by_rate, jr, tra, cov)
+        transition(dt, pushed, coupled, tilt, decay, turned, rate_turn, middle, by_rate, unknown, jr, tra, cov)
         if len(steps):
-            _transition(dt, pushed, coupled, decay, turned, rate_turn, middle, by_rate, jr, unit, steps[k])
+            transition(
+                dt, pushed, coupled, tilt, decay, turned, rate_turn, middle, by_rate, unknown, jr, unit, steps[k]
+            )
             for i in range(3):
                 for j in range(3):
                     steps[k, size + i, j] = middle[i, j]
@@ -316,10 +281,27 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
                 cov[6 + i, 9 + j] += v
                 cov[9 + j, 6 + i] += v
             cov[9 + i, 9 + i] += dt * q[3 + i]
+        if coupled and thrust_only:
+            for i in range(3):
+                for j in range(3):
+                    v = dt * (middle[i, 0] * middle[j, 0] * q[0] + middle[i, 1] * middle[j, 1] * q[1])
+                    pi, pj = pushed + i, pushed + j
+                    cov[3 + i, pj + 3] -= v
+                    cov[pj + 3, 3 + i] -= v
+                    cov[pi + 3, pj + 3] += v
+                    cov[3 + i, pj] -= h * v
+                    cov[pj, 3 + i] -= h * v
+                    cov[i, pj + 3] -= h * v
+                    cov[pj + 3, i] -= h * v
+                    cov[pi, pj + 3] += h * v
+                    cov[pj + 3, pi] += h * v
+                    cov[i, pj] -= bridge * v
+                    cov[pj, i] -= bridge * v
+                    cov[pi, pj] += bridge * v
         for i in range(size - 12):
             cov[12 + i, 12 + i] += (1.0 - decay[i] * decay[i]) * disturbance[which[i]]
         if m:
-            _transition(dt, pushed, coupled, decay, turned, rate_turn, middle, by_rate, jr, sens, new)
+            transition(dt, pushed, coupled, tilt, decay, turned, rate_turn, middle, by_rate, unknown, jr, sens, new)
             for j in range(c):
                 f0, f1, f2 = acting[k, 0, j], acting[k, 1, j], acting[k, 2, j]
                 a0, a1, a2 = acting[k, 3, j], acting[k, 4, j], acting[k, 5, j]

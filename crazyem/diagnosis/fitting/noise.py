@@ -41,10 +41,11 @@ def logs_of(noise: Noise) -> NDArray:
         return np.log(np.concatenate(scales))
 
 
-def noise_of(logs: NDArray, memory: float | NDArray) -> Noise:
-    """Inverse of `logs_of`."""
+def noise_of(logs: NDArray, like: Noise) -> Noise:
+    """Inverse of `logs_of`; the rest is that of `like`."""
     scales = np.exp(logs)
-    return Noise(scales[:6], scales[6:10], scales[10:16], memory, scales[16:20], scales[20:])
+    return replace(like, impulse=scales[:6], measurement=scales[6:10], disturbance=scales[10:16],
+                   coloured=scales[16:20], recall=scales[20:])  # fmt: skip
 
 
 def coloured(noise: Noise, flights: Sequence[Flight]) -> Noise:
@@ -135,17 +136,18 @@ def _scored(chosen: list[Part], start: Noise, tolerance: float, workers: Workers
         measured |= np.array([np.isfinite(flight.y[:, c]).any() for c in FIRST])
     lasting = measured & (start.coloured > 0)
     free = np.concatenate([np.ones(6, bool), measured, start.disturbance > 0, lasting, lasting])
-    logs, memory, floor = logs_of(start), start.memory, logs_of(SMALLEST)
+    logs, floor = logs_of(start), logs_of(SMALLEST)
     if any("attitude" not in f.signals and np.isfinite(f.y[:, 6]).any() for f, _, _ in chosen):
         floor[8] = np.log(NOISE.min_attitude)
     logs = np.maximum(logs, np.where(free, floor, -np.inf))
     typical, index = logs_of(TYPICAL), np.flatnonzero(free)
     weight = LOG_SD[index] ** -2.0
-    key = (*(f.time.size for f, _, _ in chosen), *index.tolist(), *np.atleast_1d(memory).tolist())
+    sizes, memories = (f.time.size for f, _, _ in chosen), np.atleast_1d(start.memory).tolist()
+    key = (*sizes, *index.tolist(), *memories, start.thrust_only)
 
     def look(at: NDArray) -> tuple[float, NDArray, list[Swept]]:
         """Log posterior density, its score and the passes of the flights."""
-        found = workers.map(lambda part: scored_sweep(*part, noise_of(at, memory)), chosen)
+        found = workers.map(lambda part: scored_sweep(*part, noise_of(at, start)), chosen)
         away = (at - typical)[index]
         value = sum(swept.loglik for swept, _ in found) - 0.5 * float(weight @ np.square(away))
         slope = np.sum([score[index] for _, score in found], axis=0) - weight * away
@@ -155,7 +157,7 @@ def _scored(chosen: list[Part], start: Noise, tolerance: float, workers: Workers
     for _ in range(NOISE.max_steps):
         fresh = key not in curvatures.known
         if fresh:
-            information = _information(chosen, swept, logs, memory, index, workers)
+            information = _information(chosen, swept, logs, start, index, workers)
             curvatures.known[key] = information + np.diag(weight)
         curvature = curvatures.known[key]
         step = np.clip(np.linalg.solve(curvature, score), -NOISE.max_log_step, NOISE.max_log_step)
@@ -177,7 +179,7 @@ def _scored(chosen: list[Part], start: Noise, tolerance: float, workers: Workers
         logs, value, score, swept = there, found, slope, passes
         if max(gain, promised) < tolerance:
             break
-    return noise_of(logs, memory)
+    return noise_of(logs, start)
 
 
 def _bfgs_update(curvature: NDArray, way: NDArray, change: NDArray) -> NDArray:
@@ -189,12 +191,12 @@ def _bfgs_update(curvature: NDArray, way: NDArray, change: NDArray) -> NDArray:
 
 
 def _information(
-    chosen: list[Part], here: list[Swept], logs: NDArray, memory: float | NDArray, index: NDArray, workers: Workers
+    chosen: list[Part], here: list[Swept], logs: NDArray, start: Noise, index: NDArray, workers: Workers
 ) -> NDArray:
     """Information (k, k) of the scales `index` (k,) from all flights, by differences from the passes `here`."""
 
     def sweep(at: NDArray) -> list[Swept]:
-        noise = noise_of(at, memory)
+        noise = noise_of(at, start)
         return [
             run_sweep(f, a, o, np.zeros((f.time.size, 6, 0)), np.zeros((f.time.size, 12, 0)), noise)
             for f, a, o in chosen

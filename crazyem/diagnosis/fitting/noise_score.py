@@ -14,14 +14,15 @@ from crazyem.diagnosis.fitting.kernel import DISTURBED, layout
 
 
 @compiled
-def noise_score(time, starts, measured, disturbance, memory, xf, e, s, gains, steps, known, out):
+def noise_score(time, starts, measured, thrust_only, disturbance, memory, xf, e, s, gains, steps, known, out):
     """Add the derivatives of the log-likelihood by q (6,), r (12,), disturbance (18,) and the logarithms of memory
     (18,) of `kernel.sweep` to out (54,).
 
     A memory m is in the transition phi = exp(-dt/m) of its own state and in the noise (1 - phi^2) of the step. The
     derivative by phi is r x' - N Phi P. There x is the smoothed state before the step, and P its filtered covariance.
 
-    measured: (n, 12) bool, whether a scalar was measured at a row; xf, e, s, gains, steps, known: outputs of `sweep`.
+    measured: (n, 12) bool, whether a scalar was measured at a row; thrust_only: as for `sweep`; xf, e, s, gains, steps,
+    known: outputs of `sweep`.
     """
     which, own = layout(disturbance)
     size = gains.shape[2]
@@ -78,16 +79,21 @@ def noise_score(time, starts, measured, disturbance, memory, xf, e, s, gains, st
         h = 0.5 * dt
         bridge = h * h + dt * dt / 12.0
         middle, jr = steps[k, size : size + 3], steps[k, size + 3 : size + 6]
-        for a in range(3):
+        moved, joint = r[:6].copy(), total[:6, :6].copy()  # along position and velocity
+        for a in range(2, -1, -1):
+            if a == 1 and thrust_only and own[0] and own[3]:  # along body x and y, their errors move the other way
+                e0, e1 = own[0], own[0] + 6
+                moved -= r[e0:e1]
+                joint += total[e0:e1, e0:e1] - total[:6, e0:e1] - total[e0:e1, :6]
             position = velocity = cross = angle = both = 0.0  # r'g r - g'N g along the axis
             for i in range(3):
                 mi, ji = middle[i, a], jr[i, a]
                 both += ji * (r[6 + i] * r[9 + a] - total[6 + i, 9 + a])
                 for j in range(3):
                     mj, jj = middle[j, a], jr[j, a]
-                    position += mi * mj * (r[i] * r[j] - total[i, j])
-                    velocity += mi * mj * (r[3 + i] * r[3 + j] - total[3 + i, 3 + j])
-                    cross += mi * mj * (r[i] * r[3 + j] - total[i, 3 + j])
+                    position += mi * mj * (moved[i] * moved[j] - joint[i, j])
+                    velocity += mi * mj * (moved[3 + i] * moved[3 + j] - joint[3 + i, 3 + j])
+                    cross += mi * mj * (moved[i] * moved[3 + j] - joint[i, 3 + j])
                     angle += ji * jj * (r[6 + i] * r[6 + j] - total[6 + i, 6 + j])
             rate = r[9 + a] * r[9 + a] - total[9 + a, 9 + a]
             out[a] += 0.5 * dt * (velocity + 2.0 * h * cross + bridge * position)

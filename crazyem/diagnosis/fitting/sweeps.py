@@ -24,6 +24,7 @@ class Noise:
         memory: s, their correlation time; or (6,).
         coloured: (4,) as `measurement`, of the errors that have a memory; 0: none.
         recall: (4,) s, correlation times of these.
+        thrust_only: whether onboard estimates know thrust and attitude alone, and no other force (`transition.py`).
     """
 
     impulse: NDArray
@@ -32,6 +33,7 @@ class Noise:
     memory: float | NDArray = 1.0
     coloured: NDArray = field(default_factory=lambda: np.zeros(4))
     recall: NDArray = field(default_factory=lambda: np.ones(4))
+    thrust_only: bool = True
 
     @property
     def remembered(self) -> tuple[NDArray, NDArray]:
@@ -83,14 +85,18 @@ def scored_sweep(flight: Flight, acceleration: NDArray, offset: NDArray, noise: 
     measured = np.isfinite(np.delete(flight.y, 9, axis=1))
     by_variance = np.zeros(54)
     noise_score(
-        flight.time, flight.starts, measured, spread, memory, states, swept.innovation, swept.variance, *kept,
-        by_variance,
+        flight.time, flight.starts, measured, _thrust_only(flight, noise), spread, memory, states,
+        swept.innovation, swept.variance, *kept, by_variance,
     )  # fmt: skip
     by_scale = np.concatenate(
         [by_variance[:6], _threes(by_variance[6:18]), by_variance[18:24], _threes(by_variance[24:36])]
     )
     scales = np.concatenate([noise.impulse, noise.measurement, noise.disturbance, noise.coloured])
     return swept, np.append(2.0 * by_scale * np.square(scales), _threes(by_variance[42:]))
+
+
+def _thrust_only(flight: Flight, noise: Noise) -> int:
+    return int(flight.fused and noise.thrust_only)
 
 
 def _threes(values: NDArray) -> NDArray:
@@ -118,8 +124,8 @@ def _run(
         flight.time, flight.starts, flight.y, np.ascontiguousarray(acceleration[:, :3]),
         np.ascontiguousarray(acceleration[:, 3:]), offset, acting, showing, np.square(noise.impulse),
         np.repeat(np.square(noise.measurement), 3), *noise.remembered, WIDE,
-        flight.block if m else np.zeros(n, np.int64), predicted, filtered, innovation, variance, rows, score,
-        information, *kept,
+        flight.block if m else np.zeros(n, np.int64), _thrust_only(flight, noise), predicted, filtered,
+        innovation, variance, rows, score, information, *kept,
     )  # fmt: skip
     if not np.all(variance >= 0.0):
         loglik = -np.inf
