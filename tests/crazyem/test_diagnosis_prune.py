@@ -52,7 +52,7 @@ def test_what_is_expected_on_flights_held_out_is_what_their_likelihood_would_los
     fixed = apart.constraining(candidate.effect) if candidate is DRAG else apart  # as in the fit without it
     values = [held_out_fit(fixed, p, [candidate]).loglik for p in points]
     wanted = -0.5 * np.polynomial.Polynomial.fit(sizes, values, 2).deriv(2)(1.0)
-    found = prune._expected(apart, fitted, [candidate], candidate)
+    found = prune._expected(apart, fitted, [candidate], Trial(candidate, 0.0, 0.0, 1.0, 0.0))
     # Bounds of what is always free and terms of second order are left out. The value tells a flight that can answer
     # from one that cannot, for which a factor of two does.
     assert wanted / 2 < found < wanted * 2
@@ -63,11 +63,14 @@ def test_a_drag_is_expected_to_gain_against_none_of_it_not_against_a_usual_one(m
     apart = Data([flight_of(fly(seconds=6.0), TRIMMED)])
     drag = {"linear_drag": dict.fromkeys("xyz", 0.05)}
     fitted = SimpleNamespace(point=Point(TRIMMED, {**TRIMMED.effects, **drag}, start_noise()))
-    found = prune._expected(apart, fitted, [DRAG], DRAG)
-    assert found == pytest.approx(prune._expected(apart.constraining("linear_drag"), fitted, [DRAG], DRAG))
+    drag = Trial(DRAG, 0.0, 0.0, 1.0, 0.0)
+    found = prune._expected(apart, fitted, [DRAG], drag)
+    assert found == pytest.approx(prune._expected(apart.constraining("linear_drag"), fitted, [DRAG], drag))
     assert not apart.constrained
     monkeypatch.setattr(prune, "can_be_finding", lambda candidate: False)
-    assert prune._expected(apart, fitted, [DRAG], DRAG) < 0.9 * found
+    assert prune._expected(apart, fitted, [DRAG], drag) < 0.9 * found
+    rival = replace(drag, constrained=frozenset({"linear_drag"}))  # what took the place of this nuisance, likewise
+    assert prune._expected(apart, fitted, [DRAG], rival) == pytest.approx(found, rel=1e-3)
 
 
 def selection_of(*trials, point=POINT):
@@ -89,7 +92,8 @@ def pruned(monkeypatch):
     """
 
     def of(selection, lost, *, expected=0.0, held_out=True, without=None):
-        def fit_without(data, held_out, fitted, accepted, candidate):
+        def fit_without(data, held_out, fitted, accepted, trial):
+            candidate = trial.candidate
             nats, held = lost(accepted, candidate)
             return SimpleNamespace(point=(without or {}).get(candidate.effect, POINT), loglik=-nats), -held
 
@@ -230,8 +234,8 @@ def test_each_effect_is_judged_beside_all_the_others(monkeypatch):
     bare = {c: (SimpleNamespace(loglik=-nats), -held) for c, nats, held in (
         (drag.candidate, 30.0, 20.0), (scale.candidate, 700.0, 90.0))}  # fmt: skip
     columns = []
-    monkeypatch.setattr(prune, "_fit_without", lambda data, held_out, fitted, accepted, c: bare[c])
-    monkeypatch.setattr(prune, "_expected", lambda held_out, fitted, accepted, c: 10.0 * len(c.free))
+    monkeypatch.setattr(prune, "_fit_without", lambda data, held_out, fitted, accepted, t: bare[t.candidate])
+    monkeypatch.setattr(prune, "_expected", lambda held_out, fitted, accepted, t: 10.0 * len(t.candidate.free))
     monkeypatch.setattr(prune, "held_out_fit", lambda *a: SimpleNamespace(loglik=4.0))
     monkeypatch.setattr(
         prune, "dispersion_of", lambda fitted, count, *, offset: columns.append((count, offset)) or 1.0 + count

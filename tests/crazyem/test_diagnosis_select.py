@@ -12,7 +12,7 @@ from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, with_torque_memory, with_torque_memory_refit
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import start_noise
-from crazyem.diagnosis.fitting.nuisances import held_out_fit, held_out_twin, refine_base
+from crazyem.diagnosis.fitting.nuisances import held_out_fit, held_out_twin, nuisances, refine_base, with_nuisances
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.random_torques import peaks
 from crazyem.diagnosis.naming import prune
@@ -22,6 +22,7 @@ from crazyem.diagnosis.naming.onset import ONSET, date
 from crazyem.diagnosis.naming.select import (
     Basis,
     compared,
+    fair_step,
     hid_another,
     linear_trials,
     select,
@@ -215,14 +216,15 @@ def test_after_a_wrong_effect_is_left_out_what_it_had_hidden_is_found(
         gain, held = nats(fitted.point) - nats(basis.point)
         return replace(trial, gain=gain, held_out=held, fitted=fitted, admissible=True, value=gain, blocks=np.zeros(9))
 
-    def held_without(data: Any, held_out: Any, fitted: Any, accepted: Any, candidate: Candidate) -> tuple[Any, float]:
-        less = fit(data, fitted.point, [c for c in accepted if c is not candidate])
+    def held_without(data: Any, held_out: Any, fitted: Any, accepted: Any, trial: Trial) -> tuple[Any, float]:
+        less = fit(data, fitted.point, [c for c in accepted if c is not trial.candidate])
         return less, nats(less.point)[1]
 
     asked: list[list[str]] = []
     monkeypatch.setattr(selecting, "linear_trials", linear)
     monkeypatch.setattr(selecting, "best_starting_points", lambda data, point, accepted, candidates: candidates)
     monkeypatch.setattr(selecting, "fitted_trial", fitted_trial)
+    monkeypatch.setattr(selecting, "constrained_basis", lambda basis, candidate: basis)
     monkeypatch.setattr(selecting, "held_out_value", lambda held_out, point, accepted: (held_out, nats(point)[1]))
     monkeypatch.setattr(selecting, "date", lambda data, fitted, candidate: (fitted, candidate))
     monkeypatch.setattr(selecting, "refine_with_memory", fit)
@@ -230,7 +232,7 @@ def test_after_a_wrong_effect_is_left_out_what_it_had_hidden_is_found(
     monkeypatch.setattr(prune, "held_out_twin", lambda held_out, point, accepted: held_out)
     monkeypatch.setattr(prune, "held_out_fit", lambda held, point, accepted: SimpleNamespace(loglik=nats(point)[1]))
     monkeypatch.setattr(prune, "_fit_without", held_without)
-    monkeypatch.setattr(prune, "_expected", lambda held_out, fitted, accepted, c: EXPECTED[c.effect])
+    monkeypatch.setattr(prune, "_expected", lambda held_out, fitted, accepted, t: EXPECTED[t.candidate.effect])
     monkeypatch.setattr(prune, "dispersion_of", lambda fitted, count, *, offset: 1.0)
     data: Any = SimpleNamespace(workers=Workers(1), loglik=lambda point, passes: nats(point)[0])
     apart: Any = SimpleNamespace()
@@ -302,3 +304,36 @@ def test_the_search_goes_on_only_if_an_effect_that_is_gone_may_have_hidden_anoth
     assert not hid_another((first, last, end), {"linear_drag", "motor_lag"}, counted=True)
     assert hid_another((first, last, end), {"linear_drag"}, counted=True)  # the lag was found beside it
     assert hid_another((first, replace(last, trials=(lag, wind)), end), {"motor_lag"}, counted=True)
+
+
+def test_rivals_of_an_effect_that_is_a_nuisance_too_are_tried_without_this_nuisance() -> None:
+    """A drag of 0.05 N s/m, with a file of one drone, in which a usual drag is free: a quadratic one explains most."""
+    vehicle = replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}})
+    data = Data([flight_of(fly(Hidden(drag=(0.05, 0.05, 0.05)), seconds=8.0), vehicle)])
+    point = nominal(data, Point(vehicle, dict(vehicle.effects), start_noise()))
+    fitted = refine_base(data, point, ())
+    basis = Basis(data, None, fitted.point, (), fitted.loglik, 0.0)
+    asked = [Candidate(name, (), ("x", "y", "z")) for name in ("linear_drag", "quadratic_drag")]
+    linear = linear_trials(data, fitted.point, (), asked)
+    alone = {t.candidate.effect: t for t in step_of(basis, linear, say=lambda text: None).trials}
+    step = fair_step(basis, linear, asked, say=lambda text: None)
+    found = {t.candidate.effect: t for t in step.trials}
+    assert step.taken is found["linear_drag"]
+    assert {t.constrained for t in found.values()} == {frozenset({"linear_drag"})}
+    assert alone["quadratic_drag"].gain < 0.2 * alone["linear_drag"].gain
+    assert 0.5 * found["linear_drag"].gain < found["quadratic_drag"].gain < found["linear_drag"].gain
+
+
+def test_a_candidate_in_the_place_of_another_is_fitted_where_the_other_is_neutral() -> None:
+    """By the linear approximation: there the likelihood has no slope, to what two passes of the filter differ by."""
+    data = Data([flight_of(fly(Hidden(torque=0.8), seconds=6.0), DRONE)])
+    scale, wind = Candidate("torque_scale", (), ("scale",)), Candidate("wind", (), ("x", "y", "z"))
+    point = nominal(data, Point(DRONE, {}, start_noise())).with_effects({"torque_scale": {"scale": 0.8}})
+    data.settle(point)
+    ((_, solution),) = linear_trials(data, point, (scale,), [wind], instead_of=scale)
+    free = nuisances(data, point, (scale,))
+    at = with_nuisances(point, free)
+    columns = [x for c in (scale, *(c for c, _ in free), wind) for x in c.columns(at)]
+    score, information = data.gram(at, columns).total(range(len(columns)))
+    assert solution.theta[0] == pytest.approx(0.2)
+    np.testing.assert_allclose((score - information @ solution.theta)[-3:], 0.0, atol=1e-3 * np.abs(score[-3:]).max())

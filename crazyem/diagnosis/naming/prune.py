@@ -66,23 +66,24 @@ def with_conditional_gains(data: Data, held_out: Data | None, selection: Selecti
     fitted, accepted = selection.fitted, selection.accepted
     here = data.loglik(fitted.point, passes=2)
     there = held_out_fit(held_out, fitted.point, accepted).loglik if held_out else 0.0
-    bare = data.workers.map(partial(_fit_without, data, held_out, fitted, accepted), accepted)
+    found = {s.taken.candidate.effect: s.taken for s in selection.steps if s.taken}
+    trials = [found[c.effect] for c in accepted]
+    trials = [replace(t, candidate=c) for t, c in zip(trials, accepted, strict=True)]  # an onset is dated by now
+    bare = data.workers.map(partial(_fit_without, data, held_out, fitted, accepted), trials)
     again: dict[str, Trial] = {}
-    for k, (c, (less, held_less)) in enumerate(zip(accepted, bare, strict=True)):
-        trial = next(s.taken for s in selection.steps if s.taken and s.taken.candidate.effect == c.effect)
+    for k, (c, trial, (less, held_less)) in enumerate(zip(accepted, trials, bare, strict=True)):
         dispersion = dispersion_of(fitted, len(c.free), offset=sum(len(a.free) for a in accepted[:k]))
-        again[c.effect] = replace(trial, gain=here - less.loglik, dispersion=dispersion)
+        again[c.effect] = replace(found[c.effect], gain=here - less.loglik, dispersion=dispersion)
         if held_out:
-            mean = _expected(held_out, fitted, accepted, c)
+            mean = _expected(held_out, fitted, accepted, trial)
             again[c.effect] = replace(again[c.effect], held_out=there - held_less, expected=mean)
     steps = tuple(replace(s, taken=again[s.taken.candidate.effect]) if s.taken else s for s in selection.steps)
     return replace(selection, steps=steps), [less for less, _ in bare]
 
 
-def _expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate) -> float:
+def _expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], trial: Trial) -> float:
     """Mean gain of a real effect of this size on held-out flights [nats] (`evidence.expected_gain`)."""
-    if can_be_finding(candidate):
-        held_out = held_out.constraining(candidate.effect)
+    held_out, candidate = _constrained(held_out, trial), trial.candidate
     point = fitted.point if held_out.own is None else replace(fitted.point, noise=held_out.own.noise)
     rest = [c for c in accepted if c is not candidate]
     free = nuisances(held_out, point, accepted)
@@ -98,16 +99,24 @@ def _expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], can
     return expected_gain(information + np.diag(weight), slice(0, own), away, spread)
 
 
+def _constrained(data: Data, trial: Trial) -> Data:
+    """The flights without the nuisances that could stand for the effect; a nuisance could stand for itself."""
+    mine = {trial.candidate.effect} if can_be_finding(trial.candidate) else set[str]()
+    for name in mine | trial.constrained:
+        data = data.constraining(name)
+    return data
+
+
 def _fit_without(
-    data: Data, held_out: Data | None, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate
+    data: Data, held_out: Data | None, fitted: Fitted, accepted: Sequence[Candidate], trial: Trial
 ) -> tuple[Fitted, float]:
     """The fit without one of the effects, and its log-likelihood on held-out flights; the data stay as they are."""
-    rest = [a for a in accepted if a is not candidate]
-    here, there = data.twin(), held_out.twin() if held_out else None
-    if can_be_finding(candidate):
-        here, there = here.constraining(candidate.effect), there and there.constraining(candidate.effect)
-    less = refine_base(here, without(fitted.point, candidate.effect), rest, rounds=2, noise=False)
-    return less, held_out_fit(there, less.point, rest).loglik if there else 0.0
+    rest = [a for a in accepted if a is not trial.candidate]
+    here = _constrained(data.twin(), trial)
+    less = refine_base(here, without(fitted.point, trial.candidate.effect), rest, rounds=2, noise=False)
+    if held_out is None:
+        return less, 0.0
+    return less, held_out_fit(_constrained(held_out.twin(), trial), less.point, rest).loglik
 
 
 def left_out(data: Data, selection: Selection, candidate: Candidate) -> Selection:

@@ -50,9 +50,17 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 
 
 def linear_trials(
-    data: Data, point: Point, accepted: Sequence[Candidate], candidates: Sequence[Candidate]
+    data: Data,
+    point: Point,
+    accepted: Sequence[Candidate],
+    candidates: Sequence[Candidate],
+    *,
+    instead_of: Candidate | None = None,
 ) -> list[tuple[Trial, Solution]]:
-    """The trials of all candidates by the linear approximation, best first; a candidate's columns come last."""
+    """The trials of all candidates by the linear approximation, best first; a candidate's columns come last.
+
+    instead_of: one of the accepted effects, in whose place the candidates are tried.
+    """
     free = nuisances(data, point, accepted)
     point = with_nuisances(point, free)
     base = [*accepted, *(c for c, _ in free)]
@@ -74,6 +82,10 @@ def linear_trials(
     weights = np.array([0.0 for c in accepted for _ in c.free] + [w for _, p in free for w in p])
     weights = local_precision(centre, weights, freedom)
     low, high = nuisance_bounds(wide_low, wide_high, -centre, weights, freedom)
+    if instead_of is not None:
+        gone = index[list(accepted).index(instead_of)]
+        here, neutral = instead_of.values(point), instead_of.neutral(point)
+        low[gone] = high[gone] = [neutral[n] - here[n] for n in instead_of.free]
     zero = gram.solve(always, precision=weights, prior=centre, low=low, high=high) if always else None
     gain0, held0 = (zero.gain, zero.held_out) if zero else (0.0, 0.0)
     found = []
@@ -220,6 +232,7 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
         value=value,
         recording=recording,
         parameter_cost=occam_cost([trial.candidate], covariance[-k:, -k:]),
+        constrained=data.constrained,
     )
 
 
@@ -246,6 +259,38 @@ def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Call
     return Step((*trials, *rest), equals[0], tuple(t for t in equals[1:] if not _same_effect(t, equals[0])))
 
 
+def fair_step(
+    basis: Basis,
+    linear: Sequence[tuple[Trial, Solution]],
+    candidates: Sequence[Candidate],
+    *,
+    say: Callable[[str], None],
+) -> Step:
+    """One turn of the selection, in which the best effect and its rivals have the same nuisances.
+
+    An effect that is a nuisance, too, gains what it explains beyond a model without it. A rival would gain only what it
+    explains beyond this nuisance. So rivals are fitted once more, without the nuisance.
+    """
+    step = step_of(basis, linear, say=say)
+    taken, counted = step.taken, basis.held_out is not None
+    if taken is None or taken.fitted is None:
+        return step
+    same = constrained_basis(basis, taken.candidate)
+    if same is basis:
+        return step
+    name, point = taken.candidate.effect, taken.fitted.point
+    data = same.data.twin()
+    data.settle(point)
+    others = [c for c in candidates if c.effect != name]
+    linear = linear_trials(data, point, [*basis.accepted, taken.candidate], others, instead_of=taken.candidate)
+    same = replace(same, point=without(point, name))
+    rivals = basis.data.workers.map(lambda entry: fitted_trial(same, *entry, say=say), shortlist(linear))
+    trials = by_evidence([taken, *(t for t in rivals if t.fitted is not None)], counted=counted)
+    trials, equals = compared_with_refitted_noise(same, trials, say=say)
+    rest = [t for t in step.trials if all(t.candidate.effect != r.candidate.effect for r in trials)]
+    return Step((*trials, *rest), equals[0], tuple(t for t in equals[1:] if not _same_effect(t, equals[0])))
+
+
 def select(
     data: Data,
     nominal_point: Point,
@@ -269,13 +314,14 @@ def select(
         rest = [c for c in candidates if compatible(c.effect, {a.effect for a in accepted})]
         rest = without_trim_rivals(rest, accepted)
         say(f"looking for effect {len(accepted) + 1} among {len(rest)} candidates")
-        linear = linear_trials(data, point, accepted, best_starting_points(data, point, accepted, rest))
+        rest = best_starting_points(data, point, accepted, rest)
+        linear = linear_trials(data, point, accepted, rest)
         if len(accepted) > first:
             steps[-1] = replace(steps[-1], beside=additions(steps[-1], [t for t, _ in linear]))
         if len(accepted) >= SELECTION.max_effects:  # the linear trials show what stands beside the last
             steps.append(Step(tuple(t for t, _ in linear), None))
             break
-        steps.append(step_of(Basis(data, apart, point, tuple(accepted), value, held_value), linear, say=say))
+        steps.append(fair_step(Basis(data, apart, point, tuple(accepted), value, held_value), linear, rest, say=say))
         taken = steps[-1].taken
         if taken is None:
             break

@@ -38,6 +38,7 @@ class Trial:
         log_odds: log posterior odds of the effect, where the balance of the flights gives them (`steady_odds.py`).
         size: the parameters that these odds are of.
         other_evidence: nats of signals that the filter does not use.
+        constrained: nuisances that are not free in the model without the effect, since they could stand for it.
     """
 
     candidate: Candidate
@@ -55,6 +56,7 @@ class Trial:
     size: Mapping[str, float] = field(default_factory=dict)
     other_evidence: float = 0.0
     expected: float = 0.0
+    constrained: frozenset[str] = frozenset()
 
     def presence(self, order: int) -> float:
         """Probability that the effect is real, as the `order`-th that was found (from 1); look-alikes aside."""
