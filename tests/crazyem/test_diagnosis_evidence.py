@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import optimize
 
-from crazyem.diagnosis.naming.evidence import expected_gain
+from crazyem.diagnosis.naming.evidence import _inverse, expected_gain
 
 
 def information_of(rng: np.random.Generator, size: int) -> NDArray[np.float64]:
@@ -35,6 +35,18 @@ def test_the_rest_is_profiled_out_and_a_usual_spread_is_a_prior_variance(
         spread = share * np.sqrt(np.diag(variance))
         wanted = 0.5 * away @ np.linalg.inv(variance + np.diag(spread**2)) @ away
         assert expected_gain(information, own, away, spread) == pytest.approx(wanted, rel=1e-6)
+
+
+@given(st.integers(0, 10**6), st.integers(1, 6), st.sets(st.integers(0, 6), max_size=3))
+def test_what_is_not_known_has_an_inverse_of_exactly_zero(seed: int, size: int, unknown: set[int]) -> None:
+    """Rounding would become a huge information in the inverse of the inverse."""
+    matrix = information_of(np.random.default_rng(seed), size)
+    gone = [i for i in unknown if i < size]
+    matrix[gone], matrix[:, gone] = 0.0, 0.0
+    found = _inverse(_inverse(matrix))
+    assert not found[gone].any()
+    assert not found[:, gone].any()
+    np.testing.assert_allclose(found, matrix, rtol=1e-3, atol=1e-6 * np.abs(matrix).max())
 
 
 def test_it_is_the_mean_gain_of_likelihoods_whose_other_columns_are_fitted() -> None:

@@ -162,7 +162,9 @@ def _inverse(matrix: NDArray) -> NDArray:
     """
     if not np.isfinite(matrix).all():
         raise DivergedError("the curvature of a fit is not finite")
-    informed = np.diag(matrix) > 0.0
-    scale = np.sqrt(np.where(informed, np.diag(matrix), 1.0))
-    inverse: NDArray = np.linalg.pinv(matrix / np.outer(scale, scale), rcond=1e-9) / np.outer(scale, scale)
+    inverse, informed = np.zeros_like(matrix), np.flatnonzero(np.diag(matrix) > 0.0)
+    scale = np.sqrt(np.diag(matrix)[informed])
+    unit = np.outer(scale, scale)
+    part = np.ix_(informed, informed)
+    inverse[part] = np.linalg.pinv(matrix[part] / unit, rcond=1e-9, hermitian=True) / unit
     return inverse
