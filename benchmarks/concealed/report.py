@@ -136,8 +136,7 @@ def table(f: dict[str, Any], *, brief: bool = False) -> str:
         f"{sum(cases.values())} cases: {cases['nothing']} with nothing hidden, {cases['single']} single effects "
         f"({s['detectable']['n']} detectable), {cases['pair']} pairs, {cases['outside']} outside the catalogue; "
         f"{f['no_answer']} without an answer; {f.get('not_flown', 0)} more could not be flown. The ideal observer is "
-        f"known in {f['ideal_observer_known']}; where it is not, a case counts as detectable. In brackets: 95 % "
-        "intervals (Wilson).",
+        f"known in {f['ideal_observer_known']}.",
         "",
         "| figure | measured | aim |",
         "|---|---|---|",
