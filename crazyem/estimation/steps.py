@@ -2,8 +2,9 @@
 
 A window of eight seconds needs eight seconds to forget a payload. A step of the mass by a share r is an acceleration of
 -r g that the model does not predict, so the innovations of vertical velocity get a mean at once. A two-sided cumulative
-sum (Page, 1954) detects this mean and its onset. Then the window restarts and grows again. If the mass turns out to be
-unchanged, the cause was a gust, and the whole window is used again.
+sum (Page, 1954) detects this mean and its onset. Then the window restarts and grows again, and what was known of
+inertia, lag and delay is its prior. If the mass turns out to be unchanged, the cause was a gust, and the whole window
+is used again.
 
 Innovations of a real flight are not white: the thrust law has errors, and the air moves. So the unit of the innovations
 is the standard deviation of their means over a quarter of a second. In a flight with large slow errors, a step has to
@@ -197,6 +198,8 @@ class StepAwareEstimator:
         if self.adapting:
             # From the detection, not from the onset: the start of a gust must not count as a change of mass.
             self.inner.window = min(self.window, max(self._rows_since(self.steps[-1].found), SHORTEST_WINDOW))
+            if not self.adapting:
+                self._set_prior(None)
         if self.deciding:
             self._decide(self.steps[-1], estimate)
         began = self._look(estimate.time)
@@ -236,9 +239,20 @@ class StepAwareEstimator:
         before = next((m for t, m in reversed(self._mass) if t < began), estimate["mass"].value)
         self.steps.append(Step(began, estimate.time, before))
         self.inner.window = SHORTEST_WINDOW
+        self._set_prior(estimate)
         self._jump = largest_jump(
             *self.inner._inputs.between(began - ONSET_SECONDS - 0.2, estimate.time), since=began - ONSET_SECONDS
         )
+
+    def _set_prior(self, known: Estimate | None) -> None:
+        """What is known of all but mass and torque offset becomes the prior; None: the first prior again."""
+        em, setup = self.inner._em, self.inner._setup
+        if em is None or setup is None:
+            return
+        if known is not None:
+            value, sd = (np.array([getattr(p, name) for p in known.parameters.values()]) for name in ("value", "sd"))
+            setup = setup.after_step(value, sd)
+        em.setup = setup
 
     def _decide(self, step: Step, estimate: Estimate) -> None:
         since, mass = estimate.time - step.found, estimate["mass"]
@@ -253,6 +267,7 @@ class StepAwareEstimator:
         self.steps[-1] = Step(step.time, step.found, step.before, mass, real, jumped)
         if not real:
             self.inner.window = self.window  # older rows still on the tape are used again
+            self._set_prior(None)
 
 
 def estimator_for(

@@ -3,11 +3,13 @@
 import math
 from functools import cache
 
+import numpy as np
 import pytest
 from hovering import INERTIA, hover
 from hypothesis import given
 from hypothesis import strategies as st
 
+from crazyem.estimation.model import setup_for
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.estimation.steps import (
     LARGEST_INCREMENT,
@@ -51,6 +53,35 @@ def test_after_a_step_the_window_grows_again():
     assert estimator.adapting
 
 
+def test_inertia_and_lag_stay_known_beyond_a_step_and_mass_does_not():
+    """Eight rows alone would give an inertia that is wrong by half, and the first second any lag."""
+    estimator, before = StepAwareEstimator(OnlineEstimator(VEHICLE)), None
+    names = ("Ixx", "Iyy", "Izz", "motor_time_constant")
+    for sample in hover([(0.0, 0.029), (AT, 0.034)], seed=0, duration=6.0):
+        estimate = estimator.feed(sample)
+        if estimate is None:
+            continue
+        if not estimator.steps:
+            before = estimate
+            continue
+        for name in names:
+            assert abs(math.log(estimate[name].value / before[name].value)) < 0.3
+    setup, at_start = estimator.inner._em.setup, estimator.inner._setup
+    assert list(setup.prior.sd[[0, 6, 7, 8]]) == list(at_start.prior.sd[[0, 6, 7, 8]])
+    assert all(setup.prior.sd[1:5] < at_start.prior.sd[1:5])
+
+
+@given(st.lists(st.floats(1e-6, 10.0), min_size=9, max_size=9))
+def test_a_prior_after_a_step_is_never_wider_than_the_first_one(sd):
+    first = setup_for(VEHICLE)
+    theta = first.start.theta * 1.1
+    found = first.after_step(theta, np.array(sd) * np.append(theta[:5], first.unit[5:]))
+    assert np.all(found.prior.sd <= first.prior.sd)
+    same = found.prior.sd == first.prior.sd
+    assert np.all(found.prior.centre[same] == first.prior.centre[same])
+    assert np.all(found.prior.sd[~same] >= np.array(sd)[~same])
+
+
 def test_where_nothing_steps_nothing_changes():
     plain, _ = flown(0.029, 0.029, 5, aware=False)
     rows, estimator = flown(0.029, 0.029, 5)
@@ -63,6 +94,7 @@ def test_a_gust_is_noticed_and_dismissed():
     rows, estimator = flown(0.029, 0.029, 4, gust=-0.08)
     assert [s.real for s in estimator.steps] == [False]
     assert estimator.inner.window == estimator.window
+    assert estimator.inner._em.setup is estimator.inner._setup
     assert abs(rows[-1][1] / 0.029 - 1) < 0.02
 
 
