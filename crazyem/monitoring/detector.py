@@ -41,6 +41,10 @@ SETTLED = 1.0  # s after the onset, time of the second report
 LEAST_SETTLING = 0.3  # s after the detection, earliest time of the second report
 NEAR_ONSET = 0.2  # s, largest change of the onset after the detection
 SIGNATURE_ERROR = 0.1  # relative error of signatures, as parameters are known within some per cent
+# Sizes without a fault over the typical sizes of a change. The estimate of an onboard filter wanders: in undisturbed
+# flights (benchmarks/monitor) its velocity by 1.5 cm/s, the scale of its velocity by 2 %, its position by 5 mm. That is
+# 2 to 5 % of a typical change. A report needs eight times the normal size.
+NORMAL_SHARE = 0.01
 CLEAR, UNCLEAR = 0.95, 0.2  # probability from which a change is reported; s after which it is reported anyway
 RULED_OUT = 0.05  # probability below which a hypothesis is no look-alike
 
@@ -83,7 +87,7 @@ class Detector:
         self.past, self.seen = np.zeros((LAGS[-1] + 1, 12)), np.zeros(12, np.int64)
         self.covariances = np.concatenate([np.ones((1, 12)), np.zeros((len(LAGS), 12))])
         self._slow = deque([slow_error(self.covariances)], maxlen=LONGEST + 1)  # oldest first
-        self.statistic, self.determinant = np.zeros((WINDOWS, count)), np.zeros((WINDOWS, count))
+        self.excess, self.statistic, self.determinant = np.zeros((3, WINDOWS, count))
         self.size, self.variance = np.zeros((WINDOWS, size)), np.ones((WINDOWS, size))
         d = self.freedom.astype(float)
         before = SCALE_BEFORE * np.ones((LEVELS, 1))
@@ -148,9 +152,10 @@ class Detector:
         self._newest = now
         begun = self._open[0] if self._open else -1
         kernels.judge(  # also without windows, so that it is compiled before a flight
-            slots, self.columns.first, self._prior, self._maker.precision(sd), self.score,
-            self.score_n - self.score_n_of[begun], self.among, self.cross, self.among_n - self.among_n_of[begun],
-            self.statistic, self.determinant, self.size, self.variance,
+            slots, self.columns.first, self._prior, self._prior / NORMAL_SHARE**2, self._maker.precision(sd),
+            self.score, self.score_n - self.score_n_of[begun], self.among, self.cross,
+            self.among_n - self.among_n_of[begun], self.excess, self.statistic, self.determinant, self.size,
+            self.variance,
         )  # fmt: skip
         report = self._judge(now, passed, slots) if self._open else None
         self._slow.append(slow_error(self.covariances))
@@ -194,19 +199,19 @@ class Detector:
 
     def _judge(self, now: float, passed: float, slots: NDArray[np.int64]) -> Fault | None:
         levels = np.array([self._level(w) for w in self._open])
-        statistic = self.statistic[slots]
+        excess = self.excess[slots]
         scale = self.scale_of[slots, levels]
         seconds = np.maximum(SPACING * 4.0 * 2.0**levels, REGIME)
         freedom = SCALE_FREEDOM + (np.minimum(self.known_of[slots, levels], SCALE_MEMORY) / seconds)[:, None]
-        normal = freedom * np.log1p(statistic / (scale * freedom))
+        normal = freedom * np.log1p(excess / (scale * freedom))
         over = normal / self.threshold
         if self._found is not None:
-            return self._settle(now, slots, statistic, scale)
+            return self._settle(now, slots, scale)
         self.holds = bool(over.max() <= 1.0)
         if self.holds:
-            self._learn(levels, statistic, passed)
+            self._learn(levels, excess, passed)
             return None
-        report = self._report(now, slots, statistic, scale, settled=False)
+        report = self._report(now, slots, scale, settled=False)
         self._found = (now, report.onset)
         return self._first(report, now)
 
@@ -230,16 +235,14 @@ class Detector:
             self.scale[level] = np.maximum(np.maximum(first / d, third / (second * (d + 4.0))), 1.0)
             self.known[level] += passed
 
-    def _settle(
-        self, now: float, slots: NDArray[np.int64], statistic: NDArray[np.float64], scale: NDArray[np.float64]
-    ) -> Fault | None:
+    def _settle(self, now: float, slots: NDArray[np.int64], scale: NDArray[np.float64]) -> Fault | None:
         assert self._found is not None
         detected, onset = self._found
         if not self._reported:
-            return self._first(self._report(now, slots, statistic, scale, settled=False), now)
+            return self._first(self._report(now, slots, scale, settled=False), now)
         if now < max(onset + SETTLED, detected + LEAST_SETTLING):
             return None
-        report = self._report(now, slots, statistic, scale, settled=True)
+        report = self._report(now, slots, scale, settled=True)
         self._restart(now)
         return report
 
@@ -253,21 +256,13 @@ class Detector:
         self._found = (detected, report.onset)
         return report
 
-    def _report(
-        self,
-        now: float,
-        slots: NDArray[np.int64],
-        statistic: NDArray[np.float64],
-        scale: NDArray[np.float64],
-        *,
-        settled: bool,
-    ) -> Fault:
+    def _report(self, now: float, slots: NDArray[np.int64], scale: NDArray[np.float64], *, settled: bool) -> Fault:
         """Report of the most probable hypothesis and onset. Every signature has an error of `SIGNATURE_ERROR`.
 
         A statistic is divided by its own scale in the window, or by the scale of the test with the largest ratio if
         that is larger. After the detection, only windows near the onset count.
         """
-        near = np.ones(len(slots), bool)
+        statistic, near = self.statistic[slots], np.ones(len(slots), bool)
         if self._found is not None:
             away = np.abs(self.opened[slots] - self._found[1])
             near = (away < NEAR_ONSET) | (away <= away.min())

@@ -171,23 +171,26 @@ def _factor(m, size):
 
 
 @compiled
-def judge(slots, first, prior, prior_n, score, score_n, among, cross, among_n, statistic, determinant, size,
-          variance):  # fmt: skip
+def judge(slots, first, prior, normal, prior_n, score, score_n, among, cross, among_n, excess, statistic, determinant,
+          size, variance):  # fmt: skip
     """Test statistics of every hypothesis in every open window, with the nuisances integrated out.
 
     Nuisances act before and after a change: score_n (M,) and among_n (M, M) are those of the oldest window.
 
     Args:
-        first (H + 1,): columns of each hypothesis. prior (C,): precisions of the sizes. prior_n (M,): of the nuisances.
-        statistic (W, H): S' (J + prior)^-1 S, twice the logarithm of the likelihood ratio. determinant (W, H): log det
-        (1 + J / prior). size (W, C): most probable sizes, variance (W, C): their variances. Filled for open windows.
+        first (H + 1,): columns of each hypothesis. prior (C,): precisions of the sizes after a change. normal (C,): of
+            those without one. prior_n (M,): of the nuisances.
+        statistic (W, H): S' (J + prior)^-1 S, twice the logarithm of the likelihood ratio to sizes of zero. excess
+            (W, H): the same less S' (J + normal)^-1 S, of the ratio to normal sizes. determinant (W, H): log det
+            (1 + J / prior). size (W, C): most probable sizes, variance (W, C): their variances. Filled for open
+            windows.
     """
     nuisances = prior_n.shape[0]
     columns = prior.shape[0]
     m = np.empty((nuisances, nuisances))
     x = np.empty((nuisances, columns + 1))
-    hyp = np.empty((8, 8))
-    y = np.empty(8)
+    hyp, tight = np.empty((8, 8)), np.empty((8, 8))
+    y, z = np.empty(8), np.empty(8)
     for a in range(nuisances):
         for b in range(a + 1):
             m[a, b] = among_n[a, b]
@@ -213,17 +216,18 @@ def judge(slots, first, prior, prior_n, score, score_n, among, cross, among_n, s
                 v = score[w, lo + a]
                 for c in range(nuisances):
                     v -= x[c, lo + a] * x[c, columns]
-                y[a] = v
+                y[a] = z[a] = v
                 for b in range(a + 1):
                     u = among[w, lo + a, lo + b]
                     for c in range(nuisances):
                         u -= x[c, lo + a] * x[c, lo + b]
-                    hyp[a, b] = u
+                    hyp[a, b] = tight[a, b] = u
                 hyp[a, a] += prior[lo + a]
+                tight[a, a] += normal[lo + a]
                 log_prior += np.log(prior[lo + a])
-            statistic[w, k] = 0.0
+            statistic[w, k] = excess[w, k] = 0.0
             determinant[w, k] = 0.0
-            if not _factor(hyp, n):
+            if not (_factor(hyp, n) and _factor(tight, n)):
                 for a in range(n):
                     size[w, lo + a], variance[w, lo + a] = 0.0, 1.0 / prior[lo + a]
                 continue
@@ -231,7 +235,11 @@ def judge(slots, first, prior, prior_n, score, score_n, among, cross, among_n, s
                 for c in range(a):
                     y[a] -= hyp[a, c] * y[c]
                 y[a] /= hyp[a, a]
+                for c in range(a):
+                    z[a] -= tight[a, c] * z[c]
+                z[a] /= tight[a, a]
                 statistic[w, k] += y[a] * y[a]
+                excess[w, k] += y[a] * y[a] - z[a] * z[a]
                 determinant[w, k] += 2.0 * np.log(hyp[a, a])
             determinant[w, k] -= log_prior
             for a in range(n - 1, -1, -1):

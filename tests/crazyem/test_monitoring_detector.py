@@ -16,6 +16,7 @@ import synthetic
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.live.flight_monitor import FlightMonitor
 from crazyem.live.policy import FaultRules
+from crazyem.monitoring import detector
 from crazyem.monitoring.columns import Columns, RowMaker, mixing
 from crazyem.monitoring.detector import Detector
 from crazyem.monitoring.fault import Fault
@@ -92,6 +93,16 @@ def test_a_sensor_that_is_biased_is_named(flight: list[Sample]) -> None:
     reports, _ = monitored(bias)
     assert reports[0].effect == "gyro_bias"
     assert reports[0].sizes["y"].value == pytest.approx(0.1, abs=0.04)
+
+
+@pytest.mark.slow
+def test_a_change_of_a_size_that_is_normal_is_no_fault_however_certain(
+    flight: list[Sample], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wander = list(changed(flight, "velocity", lambda v: (v[0] + 0.02, v[1], v[2])))
+    assert monitored(wander)[0] == []
+    monkeypatch.setattr(detector, "NORMAL_SHARE", 1e-6)  # against a size of zero
+    assert monitored(wander)[0][0].effect == "velocity_offset"
 
 
 @pytest.mark.slow

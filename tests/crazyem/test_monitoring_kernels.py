@@ -124,10 +124,12 @@ def test_the_judgement_is_that_of_dense_algebra(seed: int) -> None:
     c, m, first = 4, 3, np.array([0, 1, 4])
     x, n, y = random.standard_normal((40, c)), random.standard_normal((40, m)), random.standard_normal(40)
     prior, prior_n = random.uniform(0.5, 2.0, c), random.uniform(0.5, 2.0, m)
+    normal = prior * random.uniform(1.0, 100.0, c)
+    excess = np.zeros((1, 2))
     out = [np.zeros((1, 2)), np.zeros((1, 2)), np.zeros((1, c)), np.zeros((1, c))]
     kernels.judge(
-        np.array([0]), first, prior, prior_n, (x.T @ y)[None], n.T @ y, (x.T @ x)[None], (x.T @ n)[None],
-        n.T @ n, *out,
+        np.array([0]), first, prior, normal, prior_n, (x.T @ y)[None], n.T @ y, (x.T @ x)[None], (x.T @ n)[None],
+        n.T @ n, excess, *out,
     )  # fmt: skip
     covariance = np.eye(40) + n @ np.diag(1 / prior_n) @ n.T
     for h, (lo, hi) in enumerate(itertools.pairwise(first)):
@@ -137,6 +139,9 @@ def test_the_judgement_is_that_of_dense_algebra(seed: int) -> None:
         with_it = covariance + a @ np.linalg.inv(p) @ a.T
         ratio = y @ np.linalg.solve(covariance, y) - y @ np.linalg.solve(with_it, y)
         assert out[0][0, h] == pytest.approx(ratio, rel=1e-8)
+        without_it = covariance + a @ np.diag(1.0 / normal[lo:hi]) @ a.T
+        more = y @ np.linalg.solve(without_it, y) - y @ np.linalg.solve(with_it, y)
+        assert excess[0, h] == pytest.approx(more, rel=1e-8)
         assert out[1][0, h] == pytest.approx(np.linalg.slogdet(with_it)[1] - np.linalg.slogdet(covariance)[1], rel=1e-8)
         np.testing.assert_allclose(out[2][0, lo:hi], np.linalg.solve(information + p, score), rtol=1e-8)
         np.testing.assert_allclose(out[3][0, lo:hi], np.diag(np.linalg.inv(information + p)), rtol=1e-8)
