@@ -189,7 +189,7 @@ def judge(slots, first, prior, normal, prior_n, score, score_n, among, cross, am
     columns = prior.shape[0]
     m = np.empty((nuisances, nuisances))
     x = np.empty((nuisances, columns + 1))
-    hyp, tight = np.empty((8, 8)), np.empty((8, 8))
+    hyp, null = np.empty((8, 8)), np.empty((8, 8))
     y, z = np.empty(8), np.empty(8)
     for a in range(nuisances):
         for b in range(a + 1):
@@ -221,13 +221,13 @@ def judge(slots, first, prior, normal, prior_n, score, score_n, among, cross, am
                     u = among[w, lo + a, lo + b]
                     for c in range(nuisances):
                         u -= x[c, lo + a] * x[c, lo + b]
-                    hyp[a, b] = tight[a, b] = u
+                    hyp[a, b] = null[a, b] = u
                 hyp[a, a] += prior[lo + a]
-                tight[a, a] += normal[lo + a]
+                null[a, a] += normal[lo + a]
                 log_prior += np.log(prior[lo + a])
             statistic[w, k] = excess[w, k] = 0.0
             determinant[w, k] = 0.0
-            if not (_factor(hyp, n) and _factor(tight, n)):
+            if not (_factor(hyp, n) and _factor(null, n)):
                 for a in range(n):
                     size[w, lo + a], variance[w, lo + a] = 0.0, 1.0 / prior[lo + a]
                 continue
@@ -236,8 +236,8 @@ def judge(slots, first, prior, normal, prior_n, score, score_n, among, cross, am
                     y[a] -= hyp[a, c] * y[c]
                 y[a] /= hyp[a, a]
                 for c in range(a):
-                    z[a] -= tight[a, c] * z[c]
-                z[a] /= tight[a, a]
+                    z[a] -= null[a, c] * z[c]
+                z[a] /= null[a, a]
                 statistic[w, k] += y[a] * y[a]
                 excess[w, k] += y[a] * y[a] - z[a] * z[a]
                 determinant[w, k] += 2.0 * np.log(hyp[a, a])

@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from closed_loop import turned
+from closed_loop import DRONE, turned
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import coloured, fit_noise, logs_of, noise_of, sample_rows, without_negligible
 from crazyem.diagnosis.fitting.sweeps import Noise, run_sweep, scored_sweep
 from crazyem.diagnosis.flights.flight import Flight
@@ -175,3 +177,14 @@ def test_the_score_is_the_slope_of_the_likelihood(
         )
         assert score[i] == pytest.approx((up - down) / 2e-4, rel=2e-3, abs=0.05)
     assert not score[np.isinf(logs_of(noise))].any()
+
+
+@pytest.mark.parametrize("thrust_only", [True, False])
+def test_the_nominal_model_takes_the_likelier_kind_of_onboard_filter(
+    thrust_only: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight = replace(drawn(1, TRUE, rows=300)[0], fused=True)
+    data = Data([flight])
+    monkeypatch.setattr(data, "fit_noise", lambda point, near=False: point)
+    monkeypatch.setattr(data, "loglik", lambda point, passes=1: -abs(point.noise.thrust_only - thrust_only))
+    assert nominal(data, Point(DRONE, {}, TRUE)).noise.thrust_only is thrust_only

@@ -228,6 +228,22 @@ def test_what_the_balance_decides_stays_and_so_does_a_trim(pruned):
             assert found.accepted == left
 
 
+def test_an_effect_whose_onset_was_dated_later_is_left_out_of_the_fit_without_it(monkeypatch):
+    tried = trial("rotor_fault", ("scale",))
+    dated = replace(tried.candidate, fixed=(("onset_time", 3.0),))
+    selection = replace(selection_of(tried), accepted=(dated,))
+    fitted = SimpleNamespace(point=POINT)
+    rests = []
+    monkeypatch.setattr(
+        prune, "refine_base", lambda data, point, rest, **k: rests.append(list(rest)) or SimpleNamespace(loglik=-5.0)
+    )
+    monkeypatch.setattr(prune, "dispersion_of", lambda *a, **k: 1.0)
+    data = SimpleNamespace(loglik=lambda point, passes: 0.0, twin=lambda: None, workers=Workers(1))
+    found, _ = prune.with_conditional_gains(data, None, replace(selection, fitted=fitted))
+    assert rests == [[]]
+    assert found.steps[0].taken.gain == 5.0
+
+
 def test_each_effect_is_judged_beside_all_the_others(monkeypatch):
     """By the fit without it, and by the scatter of its own parameters."""
     drag, scale = trial("linear_drag", ("x", "y", "z")), trial("thrust_scale", ("scale",))

@@ -22,7 +22,7 @@ from crazyem.diagnosis.naming.onset import ONSET, date
 from crazyem.diagnosis.naming.select import (
     Basis,
     compared,
-    fair_step,
+    constrained_step,
     hid_another,
     linear_trials,
     select,
@@ -316,7 +316,7 @@ def test_rivals_of_an_effect_that_is_a_nuisance_too_are_tried_without_this_nuisa
     asked = [Candidate(name, (), ("x", "y", "z")) for name in ("linear_drag", "quadratic_drag")]
     linear = linear_trials(data, fitted.point, (), asked)
     alone = {t.candidate.effect: t for t in step_of(basis, linear, say=lambda text: None).trials}
-    step = fair_step(basis, linear, asked, say=lambda text: None)
+    step = constrained_step(basis, linear, asked, say=lambda text: None)
     found = {t.candidate.effect: t for t in step.trials}
     assert step.taken is found["linear_drag"]
     assert {t.constrained for t in found.values()} == {frozenset({"linear_drag"})}

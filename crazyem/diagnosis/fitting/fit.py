@@ -199,8 +199,8 @@ def nominal(data: Data, point: Point) -> Point:
     fitted = data.fit_noise(point)
     fitted = data.fit_noise(replace(fitted, noise=coloured(fitted.noise, data.flights)), near=True)
     if any(f.fused for f in data.flights):  # a filter that integrates an accelerometer knows all forces
-        knowing = data.fit_noise(replace(fitted, noise=replace(fitted.noise, thrust_only=False)), near=True)
-        fitted = max((fitted, knowing), key=lambda p: data.loglik(p, passes=2))
+        all_forces = data.fit_noise(replace(fitted, noise=replace(fitted.noise, thrust_only=False)), near=True)
+        fitted = max((fitted, all_forces), key=lambda p: data.loglik(p, passes=2))
     fitted = replace(fitted, noise=without_negligible(fitted.noise, data.flights))
     if data.leave_out_wild(fitted):
         data.settle(fitted)

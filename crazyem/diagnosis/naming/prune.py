@@ -67,8 +67,7 @@ def with_conditional_gains(data: Data, held_out: Data | None, selection: Selecti
     here = data.loglik(fitted.point, passes=2)
     there = held_out_fit(held_out, fitted.point, accepted).loglik if held_out else 0.0
     found = {s.taken.candidate.effect: s.taken for s in selection.steps if s.taken}
-    trials = [found[c.effect] for c in accepted]
-    trials = [replace(t, candidate=c) for t, c in zip(trials, accepted, strict=True)]  # an onset is dated by now
+    trials = [replace(found[c.effect], candidate=c) for c in accepted]  # an accepted onset is dated
     bare = data.workers.map(partial(_fit_without, data, held_out, fitted, accepted), trials)
     again: dict[str, Trial] = {}
     for k, (c, trial, (less, held_less)) in enumerate(zip(accepted, trials, bare, strict=True)):

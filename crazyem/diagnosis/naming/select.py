@@ -259,7 +259,7 @@ def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Call
     return Step((*trials, *rest), equals[0], tuple(t for t in equals[1:] if not _same_effect(t, equals[0])))
 
 
-def fair_step(
+def constrained_step(
     basis: Basis,
     linear: Sequence[tuple[Trial, Solution]],
     candidates: Sequence[Candidate],
@@ -321,7 +321,9 @@ def select(
         if len(accepted) >= SELECTION.max_effects:  # the linear trials show what stands beside the last
             steps.append(Step(tuple(t for t, _ in linear), None))
             break
-        steps.append(fair_step(Basis(data, apart, point, tuple(accepted), value, held_value), linear, rest, say=say))
+        steps.append(
+            constrained_step(Basis(data, apart, point, tuple(accepted), value, held_value), linear, rest, say=say)
+        )
         taken = steps[-1].taken
         if taken is None:
             break
