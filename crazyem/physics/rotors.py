@@ -71,26 +71,20 @@ def wrench(thrust: ArrayLike, *, arm: Sequence[float], torque_per_thrust: float)
 
 
 def wrench_from_command(command: ArrayLike, voltage: ArrayLike, vehicle: Vehicle) -> NDArray:
-    """Settled F and M of a vehicle's rotors for a command: (..., 4) duty, (...,) V -> (..., 4) N, N m.
-
-    No rotor has more than the largest thrust of the vehicle.
-    """
+    """Settled F and M of a vehicle's rotors for a command: (..., 4) duty, (...,) V -> (..., 4) N, N m."""
     thrust = thrust_from_command(command, voltage, thrust_curve=vehicle.thrust_curve)
-    thrust = np.minimum(thrust, vehicle.thrust_max)
     return wrench(thrust, arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust)
 
 
 def wrench_from_one_command(command: tuple[float, ...], voltage: float, vehicle: Vehicle) -> NDArray:
     """`wrench_from_command` for one logged command, 40 times faster: (4,) duty, V -> (4,) N, N m."""
     duty = tuple(map(float, command))
-    out: NDArray = _one_wrench(
-        duty, float(voltage), vehicle.thrust_curve, vehicle.thrust_max, vehicle.arm, vehicle.torque_per_thrust
-    )
+    out: NDArray = _one_wrench(duty, float(voltage), vehicle.thrust_curve, vehicle.arm, vehicle.torque_per_thrust)
     return out
 
 
 @compiled
-def _one_wrench(command, voltage, thrust_curve, thrust_max, arm, torque_per_thrust):
+def _one_wrench(command, voltage, thrust_curve, arm, torque_per_thrust):
     out = np.zeros(4)
     for i in range(4):
         volts = command[i] * voltage
@@ -99,8 +93,6 @@ def _one_wrench(command, voltage, thrust_curve, thrust_max, arm, torque_per_thru
             thrust = thrust * volts + thrust_curve[k]
         if command[i] == 0.0 or thrust < 0.0:  # keeps NaN
             thrust = 0.0
-        elif thrust > thrust_max:
-            thrust = thrust_max
         out[0] += thrust
         out[1] += ROLL_SIGN[i] * thrust
         out[2] += PITCH_SIGN[i] * thrust

@@ -159,13 +159,6 @@ def test_one_command_gives_what_many_give(command, voltage, preset):
     assert np.all(np.abs(rotors.wrench_from_one_command(command, voltage, vehicle) - plain) <= 1e-14 * scale)
 
 
-@given(st.tuples(*[st.floats(0.0, 1.0)] * 4), st.floats(2.5, 4.3))
-def test_no_rotor_has_more_than_the_largest_thrust_of_the_vehicle(command, voltage):
-    plain = rotors.thrust_from_command(np.array(command), np.float64(voltage), thrust_curve=CF2.thrust_curve)
-    wrench = rotors.wrench_from_one_command(command, voltage, CF2)
-    assert wrench[0] == pytest.approx(np.minimum(plain, 0.12).sum(), abs=1e-12)
-
-
 def test_one_command_keeps_what_is_not_a_number():
     assert np.isnan(rotors.wrench_from_one_command((0.5, math.nan, 0.5, 0.5), 4.0, CF2)[0])
     assert np.isnan(rotors.wrench_from_one_command((0.5, 0.5, 0.5, 0.5), math.nan, CF2)[0])
