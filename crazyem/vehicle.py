@@ -84,7 +84,7 @@ class Vehicle:
         rotor_constant: thrust over squared rotor speed [N/(rad/s)^2], or None.
         torque_per_thrust: yaw torque of a rotor over its thrust [m].
         motor_time_constant: first-order lag of rotor thrust [s].
-        thrust_max: of one rotor [N].
+        thrust_max: of one rotor [N], the full scale of the firmware's commands.
         battery_compensated: whether the firmware scales commands by battery voltage.
         effects: fitted effects, name -> parameter -> value.
         mass_sd, inertia_sd, motor_time_constant_sd: standard deviation of the value over the value, the estimator's

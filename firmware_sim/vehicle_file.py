@@ -1,8 +1,9 @@
 """A vehicle file as the truth of a scenario: `vehicle_file = "PATH.toml"`, the format in which crazyem keeps drones.
 
 TOML, SI: name, mass, inertia (3 or 6), arm (one number or [x, y]), thrust_curve (1 to 6 coefficients, constant first),
-rotor_constant, torque_per_thrust, motor_time_constant, thrust_max (inf: no limit), battery_compensated and *_sd (not
-used here), and tables [effects.NAME]. mass and inertia are required. Other missing values are the platform's.
+rotor_constant, torque_per_thrust, motor_time_constant, thrust_max (full scale of commands; inf: no limit),
+battery_compensated and *_sd (not used here), and tables [effects.NAME]. mass and inertia are required. Other missing
+values are the platform's.
 """
 
 import tomllib
@@ -13,6 +14,7 @@ from firmware_sim.errors import ScenarioError
 
 LARGEST_VEHICLE_FILE = 1 << 20  # bytes; such a file has a few hundred
 NO_LIMIT = 100.0  # N per rotor, in place of a thrust_max of inf
+RESERVE = 1.25  # limit of a rotor over the full scale of commands, as of both platforms
 _VEHICLE = (
     *("mass", "inertia", "arm", "thrust_curve", "rotor_constant"),
     *("torque_per_thrust", "motor_time_constant", "thrust_max"),
@@ -52,8 +54,9 @@ def vehicle_tables(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     if not isinstance(effects, dict):
         raise ScenarioError(f"{path}: effects must hold tables [effects.NAME]")
     vehicle = {entry: table[entry] for entry in _VEHICLE if entry in table}
-    if vehicle.get("thrust_max") == float("inf"):
-        vehicle["thrust_max"] = NO_LIMIT
+    full_scale = vehicle.get("thrust_max")
+    if isinstance(full_scale, (int, float)) and not isinstance(full_scale, bool):
+        vehicle["thrust_max"] = NO_LIMIT if full_scale == float("inf") else RESERVE * full_scale
     arm = vehicle.get("arm")
     if isinstance(arm, list) and len(arm) == 1:
         vehicle["arm"] = arm[0]

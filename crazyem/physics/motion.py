@@ -74,17 +74,15 @@ def gain(found: list[tuple[Effect, dict]], what: str) -> float:
 def settled(inputs: RotorInput, *, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, float, float]:
     """Settled thrust of the rotors at each stamp, with lag and delay.
 
-    Returns: (m, 4) N, up to the largest thrust of a rotor; the lag [s]; the delay [s].
+    Returns: (m, 4) N; the lag [s]; the delay [s].
     """
     thrust = inputs.thrust
     lag, delay = (0.0 if inputs.measured else vehicle.motor_time_constant), inputs.delay
-    if not inputs.measured and vehicle.thrust_curve:
-        thrust = np.minimum(thrust, vehicle.thrust_max)
     for effect, values in active(effects, vehicle):
         if effect.commanded is not None and not inputs.measured:
             thrust = effect.commanded(
                 thrust, time=inputs.time, flown=inputs.flown, voltage=inputs.voltage,
-                hover=vehicle.mass * GRAVITY / 4, limit=vehicle.thrust_max, **values,
+                hover=vehicle.mass * GRAVITY / 4, **values,
             )  # fmt: skip
         if effect.speed is not None and inputs.measured:
             thrust = effect.speed(thrust, **values)

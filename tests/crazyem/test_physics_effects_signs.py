@@ -136,7 +136,7 @@ HOVER = M * G / 4
     [
         ("thrust_curve", {"slope_error": 0.2}, {"thrust": HOVER}, HOVER),
         ("thrust_curve", {"slope_error": 0.2}, {"thrust": HOVER + 0.01}, HOVER + 0.012),
-        ("thrust_curve", {"slope_error": 3.0}, {"thrust": 0.119}, CF2.thrust_max),
+        ("thrust_curve", {"slope_error": 3.0}, {"thrust": 0.119}, 0.119 + 3.0 * (0.119 - HOVER)),
         ("thrust_curve", {"slope_error": 2.0}, {"thrust": 0.01}, 0.0),
         ("thrust_curve", {"slope_error": -0.5}, {"thrust": 0.0}, 0.0),
         ("thrust_curve", {"slope_error": 0.2}, {"thrust": 0.09, "speeds": True}, 0.09),

@@ -212,8 +212,7 @@ class Effect:
         parameters: see `Parameter`.
         order: effects that change the same quantity act in this order, then by name.
         commanded: (thrust (m, 4) N settled, before the lag, at m stamps; time (m,), flown (m,), voltage (m,); hover: N
-            of one rotor in hover; limit: N of one rotor at most; **parameters) -> (m, 4). Not applied to measured
-            rotor speeds.
+            of one rotor in hover; **parameters) -> (m, 4). Not applied to measured rotor speeds.
         timing: (lag s, delay s; **parameters) -> (lag, delay) of the rotors' thrust.
         speed: (thrust (m, 4) N from measured rotor speeds; **parameters) -> (m, 4). Only where speeds are measured.
         rotors: (situation; **parameters) -> (n, 4) thrust after the lag [N].

@@ -10,18 +10,18 @@ REFERENCE_VOLTAGE = 3.7  # V, at which gain_per_volt has no effect: one nearly e
 
 
 def steeper(
-    thrust: NDArray, *, time: NDArray, flown: NDArray, voltage: NDArray, hover: float, limit: float, slope_error: float
+    thrust: NDArray, *, time: NDArray, flown: NDArray, voltage: NDArray, hover: float, slope_error: float
 ) -> NDArray:
-    """Thrust f + slope_error (f - hover), within [0, limit]; 0 for a command of zero."""
+    """Thrust f + slope_error (f - hover), not below 0; 0 for a command of zero."""
     if slope_error == 0.0:
         return thrust
-    changed = np.clip(thrust + slope_error * (thrust - hover), 0.0, limit)
+    changed = np.maximum(thrust + slope_error * (thrust - hover), 0.0)
     return np.where(thrust == 0.0, 0.0, changed)
 
 
 def sagging(
-    thrust: NDArray, *, time: NDArray, flown: NDArray, voltage: NDArray, hover: float, limit: float,
-    gain_per_volt: float, gain_per_second: float,
+    thrust: NDArray, *, time: NDArray, flown: NDArray, voltage: NDArray, hover: float, gain_per_volt: float,
+    gain_per_second: float,
 ) -> NDArray:  # fmt: skip
     """Thrust times max(0, 1 + gain_per_volt (V - 3.7 V) + gain_per_second t), with t [s] since take-off.
 
