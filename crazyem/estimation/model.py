@@ -201,17 +201,17 @@ class Setup:
         process = self.known.logs(np.ones(len(NAMES)))[[2, 3, 4, 5, 0]]
         return np.nan_to_num(np.exp(2 * process), nan=0.0) * (process > np.log(2 * TINY_IMPULSE))
 
-    def after_step(self, theta: NDArray, sd: NDArray) -> "Setup":
+    def after_step(self, theta: NDArray, sd: NDArray, noise: Noise) -> "Setup":
         """The setup for a window that begins after a step of mass: what was known before is prior, mass and torque
         offset aside.
 
-        theta (9,), sd (9,): estimate before, and standard deviations in the same units.
+        theta (9,), sd (9,): estimate before, and standard deviations in the same units. noise: estimate before.
         """
         unit = np.append(np.where(self.free[:5], theta[:5], 1.0), self.unit[5:])  # the first five by their logarithms
         known = np.hypot(sd / unit, CHANGE_BY_STEP)
         kept = self.free & (known < self.prior.sd)
         prior = replace(self.prior, centre=np.where(kept, theta, self.prior.centre),
-                        sd=np.where(kept, known, self.prior.sd))  # fmt: skip
+                        sd=np.where(kept, known, self.prior.sd), noise=noise, noise_sd=NOISE_CHANGE_BY_STEP)  # fmt: skip
         return replace(self, prior=prior)
 
     @cached_property
@@ -227,6 +227,8 @@ class Setup:
 # Standard deviations of what a step of mass changes, in the coordinates of the prior: a load of a fifth of the mass at
 # half an arm from the centre has 0.1 to 0.2 of the inertia; rotors and log stay the same.
 CHANGE_BY_STEP = np.array([np.inf, 0.2, 0.2, 0.2, 0.0, 0.0, np.inf, np.inf, np.inf])
+# the same of the logarithms of noise scales: the same force on a fifth more mass
+NOISE_CHANGE_BY_STEP = 0.2
 
 # Start values of the noise scales. Process noise starts large, so that the first samples outweigh the start value.
 START_IMPULSE = np.array([0.5, 0.5, 5.0, 20.0, 20.0, 20.0])

@@ -251,7 +251,7 @@ class StepAwareEstimator:
             return
         if known is not None:
             value, sd = (np.array([getattr(p, name) for p in known.parameters.values()]) for name in ("value", "sd"))
-            setup = setup.after_step(value, sd)
+            setup = setup.after_step(value, sd, em.parameters.noise)
         em.setup = setup
 
     def _decide(self, step: Step, estimate: Estimate) -> None:

@@ -9,7 +9,7 @@ from hovering import INERTIA, hover
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crazyem.estimation.model import setup_for
+from crazyem.estimation.model import Noise, setup_for
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.estimation.steps import (
     LARGEST_INCREMENT,
@@ -53,19 +53,20 @@ def test_after_a_step_the_window_grows_again():
     assert estimator.adapting
 
 
-def test_inertia_and_lag_stay_known_beyond_a_step_and_mass_does_not():
-    """Eight rows alone would give an inertia that is wrong by half, and the first second any lag."""
-    estimator, before = StepAwareEstimator(OnlineEstimator(VEHICLE)), None
+def test_inertia_lag_and_noise_stay_known_beyond_a_step_and_mass_does_not():
+    """Eight rows alone would give an inertia that is wrong by half, the first second any lag, four rows any noise."""
+    estimator, before, noise = StepAwareEstimator(OnlineEstimator(VEHICLE)), None, None
     names = ("Ixx", "Iyy", "Izz", "motor_time_constant")
     for sample in hover([(0.0, 0.029), (AT, 0.034)], seed=0, duration=6.0):
         estimate = estimator.feed(sample)
         if estimate is None:
             continue
         if not estimator.steps:
-            before = estimate
+            before, noise = estimate, estimator.inner._em.parameters.noise
             continue
         for name in names:
             assert abs(math.log(estimate[name].value / before[name].value)) < 0.3
+        assert np.abs(estimator.inner._em.parameters.noise.logs - noise.logs).max() < 0.4
     setup, at_start = estimator.inner._em.setup, estimator.inner._setup
     assert list(setup.prior.sd[[0, 6, 7, 8]]) == list(at_start.prior.sd[[0, 6, 7, 8]])
     assert all(setup.prior.sd[1:5] < at_start.prior.sd[1:5])
@@ -75,7 +76,10 @@ def test_inertia_and_lag_stay_known_beyond_a_step_and_mass_does_not():
 def test_a_prior_after_a_step_is_never_wider_than_the_first_one(sd):
     first = setup_for(VEHICLE)
     theta = first.start.theta * 1.1
-    found = first.after_step(theta, np.array(sd) * np.append(theta[:5], first.unit[5:]))
+    noise = Noise.from_logs(first.prior.noise.logs - 1.0)
+    found = first.after_step(theta, np.array(sd) * np.append(theta[:5], first.unit[5:]), noise)
+    assert found.prior.noise is noise
+    assert found.prior.noise_sd < first.prior.noise_sd
     assert np.all(found.prior.sd <= first.prior.sd)
     same = found.prior.sd == first.prior.sd
     assert np.all(found.prior.centre[same] == first.prior.centre[same])
