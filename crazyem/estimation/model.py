@@ -210,8 +210,10 @@ class Setup:
         unit = np.append(np.where(self.free[:5], theta[:5], 1.0), self.unit[5:])  # the first five by their logarithms
         known = np.hypot(sd / unit, CHANGE_BY_STEP)
         kept = self.free & (known < self.prior.sd)
-        prior = replace(self.prior, centre=np.where(kept, theta, self.prior.centre),
-                        sd=np.where(kept, known, self.prior.sd), noise=noise, noise_sd=NOISE_CHANGE_BY_STEP)  # fmt: skip
+        prior = replace(
+            self.prior, centre=np.where(kept, theta, self.prior.centre), sd=np.where(kept, known, self.prior.sd),
+            noise=noise, noise_sd=NOISE_CHANGE_BY_STEP,
+        )  # fmt: skip
         return replace(self, prior=prior)
 
     @cached_property
