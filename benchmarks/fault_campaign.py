@@ -1,7 +1,7 @@
-"""Flights under seeded faults, with the guard, without it, and without any writes: what crashes, what goes unrecorded.
+"""Flights under seeded faults, with and without guard, monitor and writes: what crashes, what goes unrecorded.
 
     python -m benchmarks.fault_campaign run --flights 500 --arms guarded --out out/faults    # goes on where it stopped
-    python -m benchmarks.fault_campaign run --flights 100 --arms none unguarded --out out/faults
+    python -m benchmarks.fault_campaign run --flights 100 --arms none monitored unguarded --out out/faults
     python -m benchmarks.fault_campaign score --out out/faults --docs                        # docs: fault_campaign.md
 
 A crash counts as caused by a write if the same seed without writes did not crash; where a guarded flight crashed, the
@@ -29,7 +29,7 @@ from typing import Any
 LIMIT = 120.0  # s of wall time for one flight
 START = 180.0  # s more for the first flight of a process, which may compile
 OF_A_PROCESS = 40  # flights of a process; then a new one starts
-ARMS = ("none", "guarded", "unguarded")
+ARMS = ("none", "guarded", "monitored", "unguarded")  # monitored: guarded, with the monitor of faults
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "results"
 MARKS = ("<!-- faults: table -->", "<!-- /faults -->")
 
@@ -167,6 +167,7 @@ def score(folder: Path) -> dict[str, Any]:
             "flights_with_undone_sets": sum("undo" in (r.get("purposes") or {}) for r in rows),
             "median_last_mass_error": errors[len(errors) // 2] if errors else None,
             "largest_last_mass_error": errors[-1] if errors else None,
+            "flights_with_reports": sum(bool(r.get("reports")) for r in rows),
             "failures": sum(bool(r.get("fault_of_ours")) for r in rows),
             "processor_s": _median([r["processor_s"] for r in rows if r.get("processor_s")]),
             "faults": dict(Counter(k for r in rows for k in r["kinds"])),
@@ -188,6 +189,7 @@ ROWS = (
     ("writes", "parameter writes"),
     ("unrecorded_writes", "writes that left and are not in the recording"),
     ("flights_with_reverts", "flights in which values were taken back"),
+    ("flights_with_reports", "flights with reports of the monitor"),
     ("flights_with_undone_sets", "flights in which half a set was undone"),
     ("median_last_mass_error", "last mass written, median error, %"),
     ("largest_last_mass_error", "largest, %"),
@@ -196,14 +198,14 @@ ROWS = (
 
 def page(table: dict[str, Any]) -> str:
     """The tables of docs/results/fault_campaign.md."""
-    names = {"guarded": "guard", "unguarded": "no guard", "none": "no writes"}
-    lines = [f"| | {' | '.join(names.values())} |", "|---|---|---|---|"]
+    names = {"guarded": "guard", "monitored": "guard, monitor", "unguarded": "no guard", "none": "no writes"}
+    lines = [f"| | {' | '.join(names.values())} |", "|---" * (1 + len(names)) + "|"]
     for key, label in ROWS:
         values = [table[arm][key] for arm in names]
         if key.endswith("mass_error"):
             values = ["-" if v is None else f"{100 * v:.1f}" for v in values]
         lines.append(f"| {label} | {' | '.join('-' if v is None else str(v) for v in values)} |")
-    for arm, what in (("guarded", "With the guard"), ("unguarded", "Without it")):
+    for arm, what in (("guarded", "With the guard"), ("monitored", "And the monitor"), ("unguarded", "Without both")):
         seeds = ", ".join(map(str, table[arm]["seeds_of_those"]))
         lines += ["", f"{what}, seeds that crashed and did not without writes: {seeds or 'none'}."]
     return "\n".join(lines)
@@ -224,7 +226,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder of the campaign")
     parser.add_argument("--flights", type=int, default=500, help="seeds (default %(default)s)")
     parser.add_argument("--first", type=int, default=1, help="seed (default %(default)s)")
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS), help="default: all three")
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS), help="default: all")
     parser.add_argument("--speed", type=float, default=3.0, help="of the simulator (default %(default)s)")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after that; run again to go on")
     parser.add_argument("--docs", action="store_true", help="with score: write docs/results/fault_campaign.md")

@@ -26,7 +26,9 @@ from crazyem.links import open_link
 from crazyem.links.base import Packet
 from crazyem.live.controllers import LEE, writes_for
 from crazyem.live.flight import Flight, FlightPlan
+from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.guard import INERTIA_NAMES, Decision
+from crazyem.live.policy import FaultRules
 from crazyem.live.recorder import open_recorder
 from crazyem.live.session import Session
 from crazyem.live.warm_up import warm_up
@@ -284,6 +286,7 @@ class Result:
     mass_error: float = math.nan
     landing: float = math.nan  # s of firmware time at the start of the landing; NaN: never
     steps: int = 0  # changes of mass that the estimator has confirmed
+    reports: list[str] = field(default_factory=list)  # of the monitor
     seconds: float = 0.0
     processor_s: float = 0.0
 
@@ -331,7 +334,8 @@ def _fly(case: Case, arm: str, link: Any, vehicle: Vehicle, file: Path, result: 
     estimator.speed, pace.late = pace.speed, estimator.late
     recorder = open_recorder(str(file), configuration={}, vehicle=vehicle, link=link)
     assert recorder is not None
-    session = Session(bad, vehicle=vehicle, estimator=estimator, recorder=recorder)
+    monitor = monitor_for(vehicle, FaultRules(), enabled=arm == "monitored")
+    session = Session(bad, vehicle=vehicle, estimator=estimator, recorder=recorder, monitor=monitor)
     bad.session = estimator.session = session
     rules = WriteRules(dry_run=arm == "unguarded")  # the raw writer below replaces the guard
     plan = FlightPlan(trajectory_maker(["excite"], DURATION), LEE, push=arm != "none", rules=rules, baseline=BASELINE)
@@ -355,7 +359,8 @@ def _fly(case: Case, arm: str, link: Any, vehicle: Vehicle, file: Path, result: 
     result.writes = len(history.pushes)
     for push in history.pushes:
         result.purposes[push.purpose] = result.purposes.get(push.purpose, 0) + 1
-    result.stopped = str(history.guard.get("stopped", "")) if arm == "guarded" else ""
+    result.stopped = str(history.guard.get("stopped", "")) if arm in ("guarded", "monitored") else ""
+    result.reports = [fault.name for fault in history.faults if not fault.settled]
     if history.pushes and (masses := [p.value for p in history.pushes if p.parameter == LEE.mass]):
         result.mass_error = masses[-1] / case.mass_at_end() - 1.0
     result.landing = history.marks.get("estimate_end", math.nan)  # set when a landing begins

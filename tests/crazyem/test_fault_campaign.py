@@ -98,13 +98,16 @@ def test_the_table(benches, tmp_path):
     for seed, arm, more in (
         (1, "none", {}),
         (1, "guarded", {"writes": 3, "left": 3, "purposes": {"push": 2, "revert": 1}, "mass_error": -0.1}),
+        (1, "monitored", {"reports": ["payload"]}), (2, "monitored", {"reports": []}),
         (1, "unguarded", {"crashed": "tilted", "unrecorded": 1}), (2, "none", {"crashed": "fell"}),
         (2, "guarded", {"crashed": "fell"}), (2, "unguarded", {"hang": True}),
     ):  # fmt: skip
         text = json.dumps({"seed": seed, "arm": arm, "kinds": ["stall"], **more})
         (tmp_path / f"{seed}_{arm}.json").write_text(text)
     table = campaign.score(tmp_path)
-    assert [table[a]["crashed_because_of_a_write"] for a in campaign.ARMS] == [0, 0, 1]
+    assert [table[a]["crashed_because_of_a_write"] for a in campaign.ARMS] == [0, 0, 0, 1]
+    assert table["monitored"]["flights_with_reports"] == 1
+    assert "| flights with reports of the monitor | 0 | 1 | 0 | 0 |" in campaign.page(table)
     assert table["guarded"]["crashed"] == 1
     assert table["guarded"]["flights_with_reverts"] == 1
     assert table["guarded"]["median_last_mass_error"] == 0.1
