@@ -134,3 +134,29 @@ def test_what_a_filter_shows_is_remembered_by_the_tilt_before_it():
         plain = replace(model, _offsets={}).offsets(point, acceleration, tilted)
         np.testing.assert_array_equal(shown[-1], plain)
     assert np.abs(shown[1][:, 3:6] - shown[0][:, 3:6]).max() > 1e-3  # m/s, or nothing was asked
+
+
+def test_an_innovation_does_not_contain_its_own_measurements():
+    """Another velocity and rate at one row change the offsets of later rows only: the likelihood is one of predictions.
+
+    With a velocity scale of 1.1 and lags of some ms, the filtered states of the row itself would change its offset by a
+    tenth of the change, and each row would seem better predicted than it is.
+    """
+    flight, at = flight_of(fly(seconds=5.0), DRONE), 200
+    effects = {
+        "velocity_scale": {"x": 1.1, "y": 1.1, "z": 1.1},
+        "onboard_filter": {"rate_lag": 2e-3, "velocity_lag": 4e-3, "attitude_lag": 0.0, "lateral_time_constant": 0.2},
+    }
+    point = Point(DRONE, effects, start_noise())
+
+    def offsets(change):
+        y = flight.y.copy()
+        y[at, 3:6] += change
+        y[at, 10:13] += 10.0 * change
+        model = Model(replace(flight, y=y))
+        model.settle(point, passes=12)
+        return model.offsets(point, model.accelerations(point)[0])
+
+    change = np.abs(offsets(0.02) - offsets(0.0)).max(axis=1)
+    assert change[at + 1 : at + 3].max() > 1e-4
+    assert change[: at + 1].max() < 1e-9

@@ -98,11 +98,13 @@ def missing_acceleration(impulse: NDArray, step: NDArray, known: NDArray) -> NDA
     """(n, 6) specific force m/s^2 and angular acceleration rad/s^2, body axes, that a model lacks along a flight.
 
     The mean over the last `NOISE.averaging` of disturbances with memory and of corrections by measurements (both in
-    `filter_corrections`). The filter sees faster changes too late; they would look like a gyro that is early.
+    `filter_corrections`). The filter sees faster changes too late; they would look like a gyro that is early. The
+    measurements of a row are not used for the row itself: its innovations must not contain them.
     """
     forget = [1.0, -np.exp(-float(np.median(step[known])) / NOISE.averaging)] if known.any() else [1.0, 0.0]
     total, span = (lfilter([1.0], forget, v, axis=0) for v in (impulse, step[:, None]))
     mean: NDArray = total / np.maximum(span, NOISE.averaging)
+    mean[1:], mean[0] = mean[:-1].copy(), 0.0
     return mean
 
 
@@ -135,7 +137,7 @@ class Model:
 
     flight: Flight
     path: NDArray | None = None  # (n, 19) in the middle of each step
-    rows_path: NDArray | None = None  # (n, 19) filtered, at the rows
+    rows_path: NDArray | None = None  # (n, 19) at the rows, without the measurements of the row: predicted, or a start
     observed_acceleration: NDArray | None = None  # (n, 6) along that path: of the model, plus `missing_acceleration`
     observed_force: NDArray | None = None  # (n, 3) specific force over each step of that path (`observed_force`)
     _thrusts: dict[str, tuple[NDArray, NDArray]] = field(default_factory=dict)
@@ -249,7 +251,8 @@ class Model:
             return swept
         filtered, predicted = with_interpolated_states(flight, swept.filtered, swept.predicted)
         self.path = causal_middle(filtered, predicted, flight.starts)
-        self.rows_path = under_relaxed(filtered, self.rows_path, offset)
+        shown = np.where(flight.starts[:, None], filtered, predicted)
+        self.rows_path = under_relaxed(shown, self.rows_path, offset)
         found = filter_corrections(swept, flight)
         self.observed_acceleration = acceleration + missing_acceleration(*found)
         self.observed_force = observed_force(acceleration, *found)
