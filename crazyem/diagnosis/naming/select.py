@@ -306,8 +306,7 @@ def select(
     fitted = begin(data, nominal_point, ()) if begun is None else begun.fitted
     nominal = fitted.point if begun is None else begun.nominal
     point, value = fitted.point, fitted.loglik
-    accepted: list[Candidate] = [] if begun is None else list(begun.accepted)
-    steps: list[Step] = [] if begun is None else list(begun.steps)
+    accepted, steps = (list(begun.accepted), list(begun.steps)) if begun else ([], [])
     apart, held_value = held_out_value(held_out, point, accepted)
     first, reasons = len(accepted), begun.left_out if begun else {}
     while True:
@@ -321,9 +320,8 @@ def select(
         if len(accepted) >= SELECTION.max_effects:  # the linear trials show what stands beside the last
             steps.append(Step(tuple(t for t, _ in linear), None))
             break
-        steps.append(
-            constrained_step(Basis(data, apart, point, tuple(accepted), value, held_value), linear, rest, say=say)
-        )
+        basis = Basis(data, apart, point, tuple(accepted), value, held_value)
+        steps.append(constrained_step(basis, linear, rest, say=say))
         taken = steps[-1].taken
         if taken is None:
             break
