@@ -68,12 +68,10 @@ def asked(
     unsteady: float = 0.0,
     vehicle: Vehicle = DRONE,
     left: float = 30.0,
-    refits: list[Point] | None = None,
 ) -> Selection:
     """Wind and a drag, worth `named` nats, against a force by place and the drag, worth `force`.
 
-    `unsteady`: nats by which the force is better and worse in turns, block by block. `refits`: gets the points whose
-    memory of torques is chosen again.
+    `unsteady`: nats by which the force is better and worse in turns, block by block.
     """
     bare = Point(vehicle, {}, start_noise())
     point = bare.with_effects({"wind": {"x": 1.0, "y": 0.0, "z": 0.0}, "linear_drag": {"x": 0.01, "y": 0.0, "z": 0.0}})
@@ -91,13 +89,7 @@ def asked(
 
     monkeypatch.setattr(place_rivals, "left_by_place", lambda data, point: left)
     monkeypatch.setattr(place_rivals, "refine_base", fitted)
-
-    def refit(flights, at):
-        if refits is not None:
-            refits.append(at)
-        return at
-
-    monkeypatch.setattr(place_rivals, "with_torque_memory_refit", refit)
+    monkeypatch.setattr(place_rivals, "with_torque_memory_refit", lambda data, at: at)
     monkeypatch.setattr(place_rivals, "_finding", lambda data, found, nats: SimpleNamespace(nats=nats))
     found, finding = place_rivals.by_place(data, None, selection)  # type: ignore[arg-type]
     assert (finding is None) == (found is selection)
@@ -131,10 +123,6 @@ def test_where_nothing_is_left_by_place_nothing_is_compared(monkeypatch) -> None
     assert asked(monkeypatch, named=100.0, force=150.0, left=20.0).accepted == (WIND, DRAG)
 
 
-def test_with_a_trim_in_the_file_the_noise_stays(monkeypatch) -> None:
-    refits: list[Point] = []
+def test_beside_a_trim_nothing_is_compared(monkeypatch) -> None:
     trimmed = replace(DRONE, effects={"trim": {"x": 0.0, "y": 0.0, "z": 0.0}})
-    assert asked(monkeypatch, named=100.0, force=150.0, vehicle=trimmed, refits=refits).accepted == (DRAG,)
-    assert not refits
-    assert asked(monkeypatch, named=100.0, force=150.0, refits=refits).accepted == (DRAG,)
-    assert refits
+    assert asked(monkeypatch, named=100.0, force=150.0, vehicle=trimmed).accepted == (WIND, DRAG)

@@ -29,10 +29,11 @@ def by_place(
 ) -> tuple[Selection, Finding | None]:
     """The selection without effects that imitate a force by place, and the force as a finding; else as it was, None.
 
-    The force stays in the final model, but is no selected effect and is never written to a file.
+    The force stays in the final model, but is no selected effect and is never written to a file. With a trim in the
+    vehicle file noise scales are fixed, and nothing is compared.
     """
     names = [c for c in selection.accepted if c.effect in FORCE_BY_PLACE.mistaken_for]
-    if not names or "position" not in data.signals:
+    if not names or "position" not in data.signals or TRIM in selection.final.vehicle.effects:
         return selection, None
     # an imitating effect has another shape: it leaves a force by place on the fitted or the held-out flights
     if (
@@ -50,7 +51,7 @@ def by_place(
     def both(start: Point, candidates: list[Candidate], rounds: int) -> tuple[Fitted, Data]:
         together = data.together_with(held_out)  # a hover does not determine slopes
         for _ in range(rounds):  # the first noise scales are those without the force
-            fit = refine_base(together, _with_memory(together, start), candidates)
+            fit = refine_base(together, with_torque_memory_refit(together, start), candidates)
             start = fit.point
         return fit, together
 
@@ -65,18 +66,13 @@ def by_place(
         finding = _finding(again, instead, better)
         if finding is None:
             return selection, None
-        found = refine_base(data, _with_memory(data, instead.point), [*rest, FORCE])
+        found = refine_base(data, with_torque_memory_refit(data, instead.point), [*rest, FORCE])
     except DivergedError:  # the model diverges without the effects: they stay
         return selection, None
     say("  it is a force by place")
     gone = {c.effect for c in names}
     steps = tuple(s for s in selection.steps if not (s.taken and s.taken.candidate.effect in gone))
     return replace(selection, final=found.point, fitted=found, accepted=tuple(rest), steps=steps), finding
-
-
-def _with_memory(data: Data, point: Point) -> Point:
-    """The point with a new choice of the memory of torques; with a trim in the file noise scales stay."""
-    return point if TRIM in point.vehicle.effects else with_torque_memory_refit(data, point)
 
 
 def _finding(data: Data, found: Fitted, nats: float) -> Finding | None:
