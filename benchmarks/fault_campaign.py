@@ -205,7 +205,11 @@ def page(table: dict[str, Any]) -> str:
         if key.endswith("mass_error"):
             values = ["-" if v is None else f"{100 * v:.1f}" for v in values]
         lines.append(f"| {label} | {' | '.join('-' if v is None else str(v) for v in values)} |")
-    for arm, what in (("guarded", "With the guard"), ("monitored", "And the monitor"), ("unguarded", "Without both")):
+    for arm, what in (
+        ("guarded", "With the guard"),
+        ("monitored", "With guard and monitor"),
+        ("unguarded", "Without both"),
+    ):
         seeds = ", ".join(map(str, table[arm]["seeds_of_those"]))
         lines += ["", f"{what}, seeds that crashed and did not without writes: {seeds or 'none'}."]
     return "\n".join(lines)

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from firmware_sim.errors import ScenarioError
+from firmware_sim.plant.platforms import LIMIT_OVER_FULL_SCALE
 
 LARGEST_VEHICLE_FILE = 1 << 20  # bytes; such a file has a few hundred
-NO_LIMIT = 100.0  # N per rotor, in place of a thrust_max of inf
-RESERVE = 1.25  # limit of a rotor over the full scale of commands, as of both platforms
+NO_LIMIT = 100.0  # N per rotor, where its limit is larger or unknown
 _VEHICLE = (
     *("mass", "inertia", "arm", "thrust_curve", "rotor_constant"),
     *("torque_per_thrust", "motor_time_constant", "thrust_max"),
@@ -55,8 +55,8 @@ def vehicle_tables(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         raise ScenarioError(f"{path}: effects must hold tables [effects.NAME]")
     vehicle = {entry: table[entry] for entry in _VEHICLE if entry in table}
     full_scale = vehicle.get("thrust_max")
-    if isinstance(full_scale, (int, float)) and not isinstance(full_scale, bool):
-        vehicle["thrust_max"] = NO_LIMIT if full_scale == float("inf") else RESERVE * full_scale
+    if isinstance(full_scale, (int, float)) and not isinstance(full_scale, bool) and full_scale > 0.0:
+        vehicle["thrust_max"] = min(LIMIT_OVER_FULL_SCALE * full_scale, NO_LIMIT)
     arm = vehicle.get("arm")
     if isinstance(arm, list) and len(arm) == 1:
         vehicle["arm"] = arm[0]

@@ -7,6 +7,7 @@ Identification of the Crazyflie 2.0, ETH Zurich 2015 (cf2); Busetto et al., arXi
 from dataclasses import dataclass
 
 SQRT_HALF = 0.707106781  # as in power_distribution_quadrotor.c
+LIMIT_OVER_FULL_SCALE = 1.25  # thrust of a rotor at most, over the full scale of commands; assumed
 
 
 @dataclass(frozen=True)
@@ -21,10 +22,14 @@ class Platform:
     thrust_max: float
     torque_per_thrust: float
     brushless: bool
-    rotor_thrust_limit: float  # N, limit of the plant's rotor, above the firmware's full scale
     capacity: float  # A h
     power_coefficient: float  # W/N^1.5 per rotor
     rotor_constant: float  # N/(rad/s)^2
+
+    @property
+    def rotor_thrust_limit(self) -> float:
+        """N, limit of the plant's rotor."""
+        return LIMIT_OVER_FULL_SCALE * self.thrust_max
 
 
 PLATFORMS = {
@@ -37,7 +42,6 @@ PLATFORMS = {
         thrust_max=0.12,
         torque_per_thrust=0.0069928948992470565,
         brushless=False,
-        rotor_thrust_limit=0.15,
         capacity=0.25,
         power_coefficient=90.0,
         rotor_constant=2.0e-8,
@@ -51,7 +55,6 @@ PLATFORMS = {
         thrust_max=0.2,
         torque_per_thrust=0.00569278844371417,
         brushless=True,
-        rotor_thrust_limit=0.25,
         capacity=0.35,
         power_coefficient=60.0,
         rotor_constant=3.72e-8,

@@ -12,6 +12,7 @@ import pytest
 
 from crazyem.links.base import Block, Packet, ParameterWrite, Variable
 from crazyem.recordings.mcap.writer import RecordingWriter
+from crazyem.vehicle import load_vehicle
 from firmware_sim.relay.faults import UP, Fault
 from firmware_sim.scenario import parse_scenario
 
@@ -114,6 +115,15 @@ def test_the_table(benches, tmp_path):
     assert table["unguarded"]["hangs"] == 1
     assert table["unguarded"]["unrecorded_writes"] == 1
     assert table["none"]["faults"] == {"stall": 2}
+
+
+def test_the_monitor_observes_the_estimator_of_a_campaign(benches):
+    _, flight = benches
+    vehicle = load_vehicle("cf2")
+    estimator = flight.Stalling(vehicle, flight.draw(1))
+    monitor = flight.monitor_for(vehicle, flight.FaultRules(), enabled=True)
+    assert monitor.watch(estimator)
+    assert estimator.inner.on_filtered == monitor._filtered
 
 
 # --- scripts that leave their attachment ----------------------------------------------------------------------------

@@ -110,7 +110,7 @@ def test_any_table_is_a_scenario_or_a_scenario_error(table: dict) -> None:
     assert np.all(np.isfinite(scenario.truth()))
 
 
-@pytest.mark.parametrize(("full_scale", "limit"), [("0.12", 0.15), ("2", 2.5), ("inf", 100.0)])
+@pytest.mark.parametrize(("full_scale", "limit"), [("0.12", 0.15), ("2", 2.5), ("90.0", 100.0), ("inf", 100.0)])
 def test_a_rotor_has_more_thrust_than_the_full_scale_of_commands(tmp_path: Path, full_scale: str, limit: float) -> None:
     (tmp_path / "drone.toml").write_text(f"mass = 0.03\ninertia = [1e-5, 1e-5, 2e-5]\nthrust_max = {full_scale}\n")
     truth = parse_scenario({"vehicle_file": "drone.toml"}, "test", folder=tmp_path).truth()

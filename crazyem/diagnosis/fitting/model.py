@@ -251,8 +251,8 @@ class Model:
             return swept
         filtered, predicted = with_interpolated_states(flight, swept.filtered, swept.predicted)
         self.path = causal_middle(filtered, predicted, flight.starts)
-        shown = np.where(flight.starts[:, None], filtered, predicted)
-        self.rows_path = under_relaxed(shown, self.rows_path, offset)
+        at_rows = np.where(flight.starts[:, None], filtered, predicted)
+        self.rows_path = under_relaxed(at_rows, self.rows_path, offset)
         found = filter_corrections(swept, flight)
         self.observed_acceleration = acceleration + missing_acceleration(*found)
         self.observed_force = observed_force(acceleration, *found)
@@ -359,7 +359,7 @@ class Model:
         return shown if shown.any() else None
 
 
-def under_relaxed(filtered: NDArray, before: NDArray | None, offset: NDArray) -> NDArray:
+def under_relaxed(states: NDArray, before: NDArray | None, offset: NDArray) -> NDArray:
     """(n, 19) states for the next offsets of measurements, from the states of this pass and of the last one.
 
     If a measured velocity is s times too large, the offset follows from the velocity of the last pass. An error of this
@@ -367,11 +367,11 @@ def under_relaxed(filtered: NDArray, before: NDArray | None, offset: NDArray) ->
     change is taken.
     """
     if before is None or not offset[:, 3:6].any():
-        return filtered
+        return states
     old = before[:, 3:6]
     excess = np.sum(offset[:, 3:6] * old, axis=0) / np.maximum(np.sum(old * old, axis=0), 1e-12)
-    out = filtered.copy()
-    out[:, 3:6] = old + (filtered[:, 3:6] - old) / (1.0 + np.maximum(excess, 0.0))
+    out = states.copy()
+    out[:, 3:6] = old + (states[:, 3:6] - old) / (1.0 + np.maximum(excess, 0.0))
     return out
 
 

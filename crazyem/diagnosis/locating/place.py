@@ -81,7 +81,7 @@ def slope_finding(data: Data, slopes: NDArray, errors: NDArray, nats: float, veh
 
 
 def _path(model: Model) -> NDArray:
-    """The filtered path; the measured one if the model left the range of numbers."""
+    """The predicted path; the measured one if the model left the range of numbers."""
     return initial_path(model.flight) if model.rows_path is None else model.rows_path
 
 
