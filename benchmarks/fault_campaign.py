@@ -37,10 +37,10 @@ MARKS = ("<!-- faults: table -->", "<!-- /faults -->")
 class Pilot:
     """A process that flies the requested flights one after the other."""
 
-    def __init__(self, folder: Path, speed: float) -> None:
+    def __init__(self, folder: Path, speed: float, later: float) -> None:
         command = [sys.executable, "-m", "benchmarks.fault_campaign", "pilot", "--out", str(folder)]
         self._child = subprocess.Popen(
-            [*command, "--speed", str(speed)],
+            [*command, "--speed", str(speed), "--later", str(later)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=(folder / "pilot.log").open("a"),
@@ -86,7 +86,9 @@ class Pilot:
         self._child.wait()
 
 
-def run(folder: Path, *, flights: int, first: int, arms: Sequence[str], speed: float, minutes: float) -> int:
+def run(
+    folder: Path, *, flights: int, first: int, arms: Sequence[str], speed: float, minutes: float, later: float = 0.0
+) -> int:
     """Fly the missing flights; returns their number."""
     folder.mkdir(parents=True, exist_ok=True)
     until, done, pilot = time.monotonic() + 60.0 * minutes, 0, None
@@ -97,7 +99,7 @@ def run(folder: Path, *, flights: int, first: int, arms: Sequence[str], speed: f
             if pilot is None or not pilot.usable:
                 if pilot is not None:
                     pilot.close()
-                pilot = Pilot(folder, speed)
+                pilot = Pilot(folder, speed, later)
             result = pilot.fly(seed, arm)
             place = folder / f"{seed}_{arm}.json"
             temporary = place.with_suffix(".part")
@@ -124,7 +126,7 @@ def _wanted(folder: Path, seeds: Sequence[int], arms: Sequence[str]) -> Iterator
                 yield seed, "none"
 
 
-def pilot(folder: Path, speed: float) -> int:
+def pilot(folder: Path, speed: float, later: float) -> int:
     """In the child: fly the flights read from standard input; prints a line of JSON for each."""
     from benchmarks.fault_flight import fly
 
@@ -133,7 +135,7 @@ def pilot(folder: Path, speed: float) -> int:
         for line in sys.stdin:
             seed, arm = line.split()
             try:
-                result = dataclasses.asdict(fly(int(seed), arm, folder, speed=speed))
+                result = dataclasses.asdict(fly(int(seed), arm, folder, speed=speed, later=later))
             except Exception as error:  # the campaign goes on and reports the error
                 result = {"seed": int(seed), "arm": arm, "kinds": [], "fault_of_ours": repr(error)}
             cleaned = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in result.items()}
@@ -232,13 +234,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--first", type=int, default=1, help="seed (default %(default)s)")
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS), help="default: all")
     parser.add_argument("--speed", type=float, default=3.0, help="of the simulator (default %(default)s)")
+    parser.add_argument(
+        "--later", type=float, default=0.0,
+        help="s by which faults come later and flights are longer; the monitor tests from 8 s in the air on",
+    )  # fmt: skip
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after that; run again to go on")
     parser.add_argument("--docs", action="store_true", help="with score: write docs/results/fault_campaign.md")
     a = parser.parse_args(argv)
     if a.step == "pilot":
-        return pilot(a.out, a.speed)
+        return pilot(a.out, a.speed, a.later)
     if a.step == "run":
-        run(a.out, flights=a.flights, first=a.first, arms=a.arms, speed=a.speed, minutes=a.minutes)
+        run(
+            a.out, flights=a.flights, first=a.first, arms=a.arms, speed=a.speed, minutes=a.minutes, later=a.later
+        )  # fmt: skip
     table = score(a.out)
     print(json.dumps(table, indent=2))
     if a.docs:

@@ -101,6 +101,17 @@ class Case:
                 text += f"mass = {mass!r}\nposition = [0.002, -0.002, -0.01]\n"
         return text
 
+    def later(self, seconds: float) -> "Case":
+        """The same case with every fault later, but for losses that last the whole flight."""
+        moved = [{k: v + seconds if k in ("start", "end") else v for k, v in fault.items()} for fault in self.link]
+        return replace(
+            self,
+            sensor_from=self.sensor_from + seconds,
+            stall_at=self.stall_at + seconds,
+            link=tuple(moved),
+            payload=tuple((when + seconds, mass) for when, mass in self.payload),
+        )
+
     def mass_at_end(self) -> float:
         """Mass [kg] after all payload events."""
         return self.mass + sum(mass for _, mass in self.payload)
@@ -291,9 +302,12 @@ class Result:
     processor_s: float = 0.0
 
 
-def fly(seed: int, arm: str, folder: Path, *, speed: float) -> Result:
-    """Draw, fly and judge a case. Files of the flight go to `folder`."""
-    case, begun, spent = draw(seed), time.monotonic(), time.process_time()
+def fly(seed: int, arm: str, folder: Path, *, speed: float, later: float = 0.0) -> Result:
+    """Draw, fly and judge a case. Files of the flight go to `folder`.
+
+    later: s by which the faults come later and the trajectory is longer.
+    """
+    case, begun, spent = draw(seed).later(later), time.monotonic(), time.process_time()
     result = Result(seed, arm, case.kinds)
     scenario, truth, file = (folder / f"{seed}_{arm}.{end}" for end in ("toml", "csv", "mcap"))
     scenario.write_text(case.scenario(), encoding="utf-8")
@@ -312,7 +326,7 @@ def fly(seed: int, arm: str, folder: Path, *, speed: float) -> Result:
         engine.began = None
         engine.replace(faults)  # their times start here: connecting under faults is tested elsewhere
         names = _names(link)
-        _fly(case, arm, link, vehicle, file, result, pace)
+        _fly(case, arm, link, vehicle, file, result, pace, DURATION + later)
     result.crashed = crash(truth, landing=result.landing)
     left = {w for w in engine.written if int.from_bytes(w[:2], "little") in names}
     result.left, result.unrecorded = len(left), unrecorded(left, names, file)
@@ -329,7 +343,9 @@ def _fault(drawn: dict[str, Any], speed: float) -> Fault:
     return Fault(**{**drawn, **hosts, "kinds": frozenset(drawn.get("kinds", ()))})
 
 
-def _fly(case: Case, arm: str, link: Any, vehicle: Vehicle, file: Path, result: Result, pace: Pace) -> None:
+def _fly(
+    case: Case, arm: str, link: Any, vehicle: Vehicle, file: Path, result: Result, pace: Pace, duration: float
+) -> None:
     bad, estimator = Bad(link, case), Stalling(vehicle, case)
     estimator.speed, pace.late = pace.speed, estimator.late
     recorder = open_recorder(str(file), configuration={}, vehicle=vehicle, link=link)
@@ -338,7 +354,7 @@ def _fly(case: Case, arm: str, link: Any, vehicle: Vehicle, file: Path, result: 
     session = Session(bad, vehicle=vehicle, estimator=estimator, recorder=recorder, monitor=monitor)
     bad.session = estimator.session = session
     rules = WriteRules(dry_run=arm == "unguarded")  # the raw writer below replaces the guard
-    plan = FlightPlan(trajectory_maker(["excite"], DURATION), LEE, push=arm != "none", rules=rules, baseline=BASELINE)
+    plan = FlightPlan(trajectory_maker(["excite"], duration), LEE, push=arm != "none", rules=rules, baseline=BASELINE)
     flight = Flight(session, plan)
     if arm == "unguarded":
         prepare = session.push_to_controller

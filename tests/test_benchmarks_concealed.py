@@ -16,6 +16,7 @@ from benchmarks.concealed.diagnose import diagnose_all
 from benchmarks.concealed.draw import draw, write_cases
 from benchmarks.concealed.fly import _words
 from benchmarks.concealed.judge import coverage, credit, errors, outside
+from benchmarks.concealed.nuisances import spread
 from benchmarks.concealed.paths import Study, read, write
 from benchmarks.concealed.report import report, table
 from benchmarks.concealed.score import QUANTITIES, Outcome, figures
@@ -266,3 +267,16 @@ def test_the_ideal_observer_is_asked_for_what_went_wrong_alone(tmp_path: Path, m
     assert [o.nats for o in reports.outcomes(study, ideal="failures")] == [None, 3.0]
     assert [o.nats for o in reports.outcomes(study, ideal="failures")] == [None, 3.0]  # kept
     assert asked == ["0002"]
+
+
+@pytest.mark.parametrize(("mean", "sd"), [(0.0, 0.2), (1.5, 0.5), (-1.0, 2.0)])
+def test_the_prior_of_a_nuisance_is_that_of_the_draw_whatever_prior_the_fits_had(mean: float, sd: float) -> None:
+    """Values and standard deviations of fits with the prior N(0, 1), to measurements with errors of many sizes."""
+    random = np.random.default_rng(3)
+    error = random.uniform(0.1, 1.0, 20000)
+    measured = random.normal(mean, sd, error.size) + error * random.normal(size=error.size)
+    precision = 1.0 + error**-2.0
+    found_mean, found_sd, gain = spread(measured * error**-2.0 / precision, precision**-0.5)
+    assert found_mean == pytest.approx(mean, abs=0.1)
+    assert found_sd == pytest.approx(sd, rel=0.1)
+    assert gain > 10.0

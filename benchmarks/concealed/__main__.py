@@ -1,4 +1,4 @@
-"""python -m benchmarks.concealed draw|fly|diagnose|score --cases N --seed S --out DIR"""
+"""python -m benchmarks.concealed draw|fly|diagnose|score|nuisances --cases N --seed S --out DIR"""
 
 import argparse
 import sys
@@ -10,7 +10,7 @@ from .paths import Study
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.concealed", description=__doc__)
-    parser.add_argument("step", choices=("draw", "fly", "diagnose", "score"))
+    parser.add_argument("step", choices=("draw", "fly", "diagnose", "score", "nuisances"))
     parser.add_argument("--cases", type=int, default=320, help="to draw (default %(default)s)")
     parser.add_argument("--seed", type=int, default=2048, help="of the draw (default %(default)s)")
     parser.add_argument(
@@ -23,7 +23,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after that; run again to go on")
     parser.add_argument(
-        "--part", type=int, nargs=2, default=(0, 1), metavar=("K", "N"), help="fly, diagnose: share K of N"
+        "--part", type=int, nargs=2, default=(0, 1), metavar=("K", "N"), help="fly, diagnose, nuisances: share K of N"
     )
     parser.add_argument("--command", nargs="+", help="diagnose: instead of `crazyem diagnose`")
     parser.add_argument("--limit", type=float, default=900.0, help="diagnose: s after which an answer counts as none")
@@ -58,6 +58,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         from .diagnose import diagnose_all
 
         diagnose_all(study, command=arguments.command, minutes=arguments.minutes, part=part, limit=arguments.limit)
+    elif arguments.step == "nuisances":
+        from .nuisances import fit_all, table
+
+        fit_all(study, part=part)
+        print(table(study))
     else:
         from .report import report
 

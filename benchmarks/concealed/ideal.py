@@ -45,7 +45,7 @@ def ideal_nats(
     if _beyond(effects, seen):
         return None
     data = Data([flight_of(seen, vehicle)])
-    without = _best(data, nominal(data, Point(vehicle, known_effects(vehicle), start_noise())), ())
+    without = best_fit(data, nominal(data, Point(vehicle, known_effects(vehicle), start_noise())), ())
     return _under(data, without.point, effects) - without.loglik
 
 
@@ -58,7 +58,7 @@ def ideal_nats_of_each(
     if _beyond(effects, seen):
         return dict.fromkeys(effects)
     data = Data([flight_of(seen, vehicle)])
-    start = _best(data, nominal(data, Point(vehicle, known_effects(vehicle), start_noise())), ()).point
+    start = best_fit(data, nominal(data, Point(vehicle, known_effects(vehicle), start_noise())), ()).point
     whole = _under(data, start, effects)
     return {
         name: whole - _under(data, start, {other: table for other, table in effects.items() if other != name})
@@ -75,7 +75,7 @@ def _under(data: Data, start: Point, effects: Mapping[str, Mapping[str, Any]]) -
     """Log-likelihood under known effects."""
     point = replace(start, effects={**known_effects(start.vehicle), **{n: dict(table) for n, table in effects.items()}})
     data.settle(point)
-    return _best(data, point, effects).loglik
+    return best_fit(data, point, effects).loglik
 
 
 def known_effects(vehicle: Vehicle) -> dict[str, dict[str, Any]]:
@@ -88,7 +88,7 @@ def options_of(mapping: Path | None) -> ReadOptions:
     return ReadOptions(None if mapping is None else str(mapping))
 
 
-def _best(data: Data, point: Point, hidden: Iterable[str]) -> Fitted:
+def best_fit(data: Data, point: Point, hidden: Iterable[str]) -> Fitted:
     """The best fit of the quantities beside the hidden effects: noise scales, memory of the torques or none, nuisances
     such as the trim of the day."""
     known = [Candidate(name, (), ()) for name in hidden]

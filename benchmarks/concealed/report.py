@@ -55,15 +55,19 @@ def _given(study: Study, truth: Mapping[str, Any]) -> Vehicle:
     return parse_vehicle(study.vehicle(truth["case"]).read_text())
 
 
-def _unhidden(study: Study, truth: Mapping[str, Any]) -> Vehicle:
-    """The same with the true drag, if the file leaves it out, and with the changes of the day of the flight."""
+def unhidden(
+    study: Study, truth: Mapping[str, Any], flight: str = "recording"
+) -> tuple[Vehicle, dict[str, dict[str, Any]]]:
+    """The given vehicle with the true drag, if its file leaves that out, and the changes of the day of a flight; and
+    the hidden effects on that day."""
     given = _given(study, truth)
-    return replace(given, effects={**given.effects, **truth.get("built", {}), **_day(truth, {})})
+    hidden = {n: _day(truth, flight, truth["effects"]).get(n, t) for n, t in truth["effects"].items()}
+    return replace(given, effects={**given.effects, **truth.get("built", {}), **_day(truth, flight, {})}), hidden
 
 
-def _day(truth: Mapping[str, Any], hidden: dict[str, Any]) -> dict[str, Any]:
-    """Changes of the day of the fitted flight, added to the hidden effects."""
-    return of_the_day(dict(truth), "recording", hidden) if "own" in truth else {}
+def _day(truth: Mapping[str, Any], flight: str, hidden: dict[str, Any]) -> dict[str, Any]:
+    """Changes of the day of a flight, added to the hidden effects."""
+    return of_the_day(dict(truth), flight, hidden) if "own" in truth else {}
 
 
 def _known(study: Study, case: str) -> Path:
@@ -73,8 +77,7 @@ def _known(study: Study, case: str) -> Path:
 def _know(study: Study, case: str, truth: Mapping[str, Any], *, held_out: bool) -> None:
     """Store nats of the truth on the flight and, if asked, held-out errors of nominal, fitted and true model."""
     known: dict[str, Any] = read(_known(study, case)) or {"held_out": {}}
-    vehicle, mapping = _unhidden(study, truth), study.mapping(case)
-    hidden = {n: _day(truth, truth["effects"]).get(n, t) for n, t in truth["effects"].items()}
+    (vehicle, hidden), mapping = unhidden(study, truth), study.mapping(case)
     if known.get("nats") is None and truth["kind"] in ("single", "pair"):
         known["nats"] = ideal_nats(study.recording(case, "recording"), vehicle, hidden, mapping=mapping)
     if known.get("of_each") is None and truth["kind"] == "pair":

@@ -16,6 +16,9 @@ IDENTIFIABLE = 0.15  # largest standard deviation of a logarithm that counts as 
 IMPLAUSIBLE_SD = 3.0  # prior standard deviations from the centre, beyond which an inertia is implausible
 FEWEST_SAMPLES = 20  # samples in flight before anything counts as identified
 NOT_CONVERGED = "not converged yet"  # reason of an estimate whose passes have not reached the maximum
+ROTATION_UNEXPLAINED = (
+    "the data ask for an inertia far from any such drone's: the logged commands do not explain its rotation"
+)
 _INERTIA = (np.arange(len(NAMES)) > 0) & (np.arange(len(NAMES)) < LAG)
 _LOGARITHMIC = np.arange(len(NAMES)) < DELAY
 
@@ -42,10 +45,8 @@ def estimate_of(
     """
     prior, unit = setup.prior, setup.unit
     theta, sd, below, above = _interval(parameters, information, unit, marginal)
-    # An inertia that is very improbable by the prior means that the model is wrong here, not that the drone is unusual.
     deviation = np.abs(offset(theta, prior.centre, unit))
-    implausible = deviation > IMPLAUSIBLE_SD * prior.sd
-    distrusted = implausible & _INERTIA
+    distrusted = implausible_inertia(theta, setup)
     if distrusted.any():
         sd = np.where(distrusted, np.maximum(sd, deviation), sd)
         below, above = np.where(distrusted, -1.96 * sd, below), np.where(distrusted, 1.96 * sd, above)
@@ -54,7 +55,7 @@ def estimate_of(
     if not setup.free[LAG]:  # the inputs contain the lag, so the data carry no information on it
         absolute[LAG], low[LAG], high[LAG] = math.inf, 0.0, math.inf
     said = {}
-    columns = (v.tolist() for v in (theta, sd, absolute, low, high, implausible))
+    columns = (v.tolist() for v in (theta, sd, absolute, low, high, distrusted))
     for i, (name, value, spread, of_value, least, most, odd) in enumerate(zip(NAMES, *columns, strict=True)):
         reason = _objection(i, spread, setup, information, samples=samples, converged=converged, implausible=odd)
         said[name] = ParameterEstimate(value, of_value, (least, most), PARAMETER_UNITS[name], not reason, reason)
@@ -69,6 +70,16 @@ def estimate_of(
         updates=updates,
         converged=converged,
     )
+
+
+def implausible_inertia(theta: NDArray, setup: Setup) -> NDArray:
+    """(9,) bool, inertias that are very improbable by the prior: the model is wrong, the drone is not unusual.
+
+    theta: (9,) parameters.
+    """
+    deviation = np.abs(offset(theta, setup.prior.centre, setup.unit))
+    found: NDArray = (deviation > IMPLAUSIBLE_SD * setup.prior.sd) & _INERTIA
+    return found
 
 
 def _interval(
@@ -99,8 +110,8 @@ def _objection(
         return "" if sd < 0.7 * setup.prior.sd[i] else "the data say no more than the prior does"
     if samples < FEWEST_SAMPLES:
         return f"only {samples} samples in flight"
-    if implausible and inertia:
-        return "the data ask for an inertia far from any such drone's: the logged commands do not explain its rotation"
+    if implausible:
+        return ROTATION_UNEXPLAINED
     if not sd < IDENTIFIABLE:
         if inertia and abs(information.bias[i]) > IDENTIFIABLE:
             return (

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from crazyem.estimation.em import WindowEM
 from crazyem.estimation.model import Parameters
+from crazyem.estimation.verdict import ROTATION_UNEXPLAINED, implausible_inertia
 from crazyem.live.policy import FaultRules
 from crazyem.monitoring.detector import Detector
 from crazyem.monitoring.fault import Fault
@@ -52,6 +53,7 @@ class FlightMonitor:
 
     Attributes:
         faults: reports, one for each fault: the settled report replaces the first one.
+        suspended: why the detector does not test, "" if it does.
     """
 
     def __init__(self, vehicle: Vehicle, rules: FaultRules, *, on_fault: Callable[[Fault], None] | None = None) -> None:
@@ -62,6 +64,7 @@ class FlightMonitor:
         self._runs = {name: RunTest(SHARE_OF_RUNS * per_hour / len(REPEATING)) for name in REPEATING}
         self._broken = -math.inf  # s, last time at which the model did not hold
         self.faults: tuple[Fault, ...] = ()
+        self.suspended = ""
 
     def watch(self, estimator: Any) -> bool:
         """Observe an estimator, or the one inside it; False if it cannot be observed."""
@@ -99,10 +102,21 @@ class FlightMonitor:
         return self.rules.action == "land" and not fault.followed
 
     @property
+    def tested(self) -> float:
+        """s of flight in which the detector has tested."""
+        return self._detector.tested
+
+    @property
     def _stuck(self) -> bool:
         return any(test.alarmed for test in self._runs.values())
 
     def _filtered(self, em: WindowEM, p: Parameters, first: int, last: int, sd: NDArray[np.float64] | None) -> None:
+        # innovations about a model that does not describe the rotation say nothing of faults
+        unexplained = bool(implausible_inertia(p.theta, em.setup).any())
+        self.suspended = ROTATION_UNEXPLAINED if unexplained else ""
+        if unexplained:
+            self._detector.pause(float(em.tape.time[last - 1]))
+            return
         known = np.where(em.setup.free, em.setup.prior.sd, 0.0) if sd is None else sd
         report = self._detector.take(em, p, first, last, known)
         if report is not None:

@@ -68,7 +68,7 @@ class History:
         marks: phase -> time on the drone's clock [s]: trajectory_start, trajectory_end, push_enabled.
         notices: sentences for the user.
         steps: detected changes of mass; the cause of the newest may be undecided.
-        faults: reports of the monitor.
+        faults: reports of the monitor. monitored: s of flight in which the monitor has tested.
         guard: mode, policy and decisions of the guard, empty without one (see `WriteSupervisor`).
     """
 
@@ -81,6 +81,7 @@ class History:
     losses: list[tuple[float, int]] = field(default_factory=list)
     steps: tuple[Step, ...] = ()
     faults: tuple[Fault, ...] = ()
+    monitored: float = 0.0
     guard: dict[str, Any] = field(default_factory=dict)
 
     def notice(self, sentence: str) -> None:

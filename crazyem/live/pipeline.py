@@ -117,7 +117,9 @@ class Pipeline:
             return None
         self.history.keep(estimate)
         if self.monitor is not None:
-            self.history.faults = self.monitor.faults
+            self.history.faults, self.history.monitored = self.monitor.faults, self.monitor.tested
+            if self.monitor.suspended:
+                self.history.notice(f"The monitor looks for no faults while {self.monitor.suspended}.")
         self._take_steps(estimate.time)
         if self.guard is not None:
             self.decision = self.guard.consider(

@@ -45,6 +45,7 @@ def build_summary(
         "guard": history.guard or None,
         "steps": [step.to_json() for step in history.steps],
         "faults": [fault.to_json() for fault in history.faults],
+        "monitored_s": history.monitored,
         "updates": estimate.updates,
         "update_ms": {
             "median": float(np.median(ms)) if ms.size else None,

@@ -57,6 +57,7 @@ class Detector:
 
     Attributes:
         holds: whether the model holds; False from a detection until the restarted tests are below their thresholds.
+        tested: s of flight with tests.
     """
 
     def __init__(self, vehicle: Vehicle, *, false_alarms_per_hour: float = 0.1) -> None:
@@ -98,6 +99,7 @@ class Detector:
         self.scale_of = np.full((WINDOWS, LEVELS, count), SCALE_BEFORE)  # scale when a window opened
         self.known_of = np.zeros((WINDOWS, LEVELS))
         self.holds = True
+        self.tested = 0.0
         self._reference: Any = (-math.inf, None, None)  # start time, parameters, their standard deviations
         self._restart(-math.inf)
 
@@ -110,6 +112,14 @@ class Detector:
         self._found: tuple[float, float] | None = None  # s, detection and onset of a change
         self._reported = False
         self.drift[:], self.n[:], self.n_slow[:], self.e_slow[:] = 0.0, 0.0, 0.0, 0.0
+
+    def pause(self, time: float) -> None:
+        """Drop all windows and learn from `time` [s] on, as the model of the estimator does not describe the drone.
+
+        A change that was found keeps its windows until its second report.
+        """
+        if self._found is None:
+            self._restart(time)
 
     # rows -------------------------------------------------------------------------------------------------------
 
@@ -198,6 +208,7 @@ class Detector:
         return min(max(math.ceil(math.log2(max(age, 1.0) / 4.0)), 0), LEVELS - 1)
 
     def _judge(self, now: float, passed: float, slots: NDArray[np.int64]) -> Fault | None:
+        self.tested += passed
         levels = np.array([self._level(w) for w in self._open])
         excess = self.excess[slots]
         scale = self.scale_of[slots, levels]

@@ -13,15 +13,14 @@ from closed_loop import DRONE, Hidden, fly
 from crazyem.diagnosis import diagnose as diagnosing
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
-from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, nominal
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import COARSE_REASON, refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.locating.random_torques import AT_RANDOM
-from crazyem.diagnosis.naming import answer, trials
-from crazyem.diagnosis.naming import select as selecting
+from crazyem.diagnosis.naming import answer, onset, trials
 from crazyem.diagnosis.naming.named import confidence_factor
 from crazyem.diagnosis.naming.select import select
 from crazyem.diagnosis.naming.trials import Selection
@@ -58,22 +57,26 @@ def test_an_inertia_that_no_body_has_leaves_open_what_turns_the_drone(slow_to_tu
 
 
 @pytest.mark.slow
-def test_what_went_on_to_its_end_is_taken_back_and_the_selection_goes_on(monkeypatch):
-    """As a slope of the thrust curve did, in the fit with all that is free: a thrust that does not heed its command."""
+@pytest.mark.parametrize("diverges", [False, True])
+def test_an_effect_without_a_sound_fit_is_left_out_and_the_selection_goes_on(monkeypatch, diverges):
+    """In the fit with all nuisances, a thrust scale is at the end of its range, or the filter leaves the numbers."""
     data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02), thrust=(0.9,) * 4), seconds=10.0), DRONE)])
     point = nominal(data, Point(DRONE, {}, start_noise()))
-    real, said = selecting.refine_with_memory, []
+    real, said = onset.refine_with_memory, []
     end = THRUST.range_of("scale")[0]
 
-    def too_far(data, point, accepted, **more):
+    def unsound(data, point, accepted, **more):
         fit = real(data, point, accepted, **more)
-        if said and "found thrust_scale" in said[-1]:
-            return replace(fit, point=fit.point.with_effects({"thrust_scale": {"scale": end}}))
-        return fit
+        if accepted[-1] is not THRUST:
+            return fit
+        if diverges:
+            raise DivergedError("the filter leaves the range of numbers")
+        return replace(fit, point=fit.point.with_effects({"thrust_scale": {"scale": end}}))
 
-    monkeypatch.setattr(selecting, "refine_with_memory", too_far)
+    monkeypatch.setattr(onset, "refine_with_memory", unsound)
     found = select(data, point, [THRUST, DRAG], say=said.append)
-    assert sum("at the end of its physical range: thrust_scale" in text for text in said) == 1
+    reason = "the model leaves the range of numbers" if diverges else "at the end of its physical range"
+    assert sum(f"{reason}: thrust_scale" in text for text in said) == 1
     assert "thrust_scale" not in {c.effect for c in found.accepted}
     assert "thrust_scale" not in found.final.effects
     assert all(s.taken.candidate.effect != "thrust_scale" for s in found.steps if s.taken)

@@ -15,7 +15,7 @@ from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import held_out_fit, held_out_twin, nuisances, refine_base, with_nuisances
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.random_torques import peaks
-from crazyem.diagnosis.naming import prune
+from crazyem.diagnosis.naming import onset, prune
 from crazyem.diagnosis.naming import select as selecting
 from crazyem.diagnosis.naming.evidence import joint_gain
 from crazyem.diagnosis.naming.onset import ONSET, date
@@ -225,9 +225,10 @@ def test_after_a_wrong_effect_is_left_out_what_it_had_hidden_is_found(
     monkeypatch.setattr(selecting, "best_starting_points", lambda data, point, accepted, candidates: candidates)
     monkeypatch.setattr(selecting, "fitted_trial", fitted_trial)
     monkeypatch.setattr(selecting, "constrained_basis", lambda basis, candidate: basis)
-    monkeypatch.setattr(selecting, "held_out_value", lambda held_out, point, accepted: (held_out, nats(point)[1]))
-    monkeypatch.setattr(selecting, "date", lambda data, fitted, candidate: (fitted, candidate))
-    monkeypatch.setattr(selecting, "refine_with_memory", fit)
+    for module in (selecting, onset):
+        monkeypatch.setattr(module, "held_out_value", lambda held_out, point, accepted: (held_out, nats(point)[1]))
+        monkeypatch.setattr(module, "refine_with_memory", fit)
+    monkeypatch.setattr(onset, "date", lambda data, fitted, candidate: (fitted, candidate))
     monkeypatch.setattr(prune, "refine_base", fit)
     monkeypatch.setattr(prune, "held_out_twin", lambda held_out, point, accepted: held_out)
     monkeypatch.setattr(prune, "held_out_fit", lambda held, point, accepted: SimpleNamespace(loglik=nats(point)[1]))

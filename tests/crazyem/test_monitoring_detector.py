@@ -14,6 +14,7 @@ import pytest
 import synthetic
 
 from crazyem.estimation.online import OnlineEstimator
+from crazyem.estimation.verdict import ROTATION_UNEXPLAINED
 from crazyem.live.flight_monitor import FlightMonitor
 from crazyem.live.policy import FaultRules
 from crazyem.monitoring import detector
@@ -70,7 +71,8 @@ def command_of_more(rotor: int, loss: float) -> Callable[[tuple[float, ...]], tu
 def test_a_flight_without_a_fault_gives_no_report(flight: list[Sample]) -> None:
     reports, monitor = monitored(flight)
     assert reports == []
-    assert monitor.stops(SECONDS) == ""
+    assert monitor.stops(SECONDS) == monitor.suspended == ""
+    assert monitor.tested == pytest.approx(SECONDS - detector.LEARNING, abs=1.0)
 
 
 def test_a_rotor_that_loses_a_tenth_is_named_with_its_size(flight: list[Sample]) -> None:
@@ -85,6 +87,20 @@ def test_a_rotor_that_loses_a_tenth_is_named_with_its_size(flight: list[Sample])
     assert monitor.stops(settled.detected).startswith("the model of the flight does not hold")
     assert len(monitor.faults) == len(reports) - 1
     assert settled.to_json()["rotor"] == 3
+
+
+@pytest.mark.slow
+def test_nothing_is_reported_while_the_commands_do_not_explain_the_rotation(flight: list[Sample]) -> None:
+    """Torques that are logged 60 times too large: the drone seems to have 60 times its inertia."""
+    unlike = [
+        replace(s, value=(s.value[0], *(60.0 * v for v in s.value[1:]))) if s.signal == "wrench_command" else s
+        for s in flight
+        if s.time < 10.0
+    ]
+    reports, monitor = monitored(unlike)
+    assert reports == []
+    assert monitor.suspended == ROTATION_UNEXPLAINED
+    assert monitor.tested == 0.0
 
 
 @pytest.mark.slow

@@ -244,6 +244,14 @@ def held_out_twin(held_out: Data, point: Point, accepted: Sequence[Candidate]) -
     return twin
 
 
+def held_out_value(held_out: Data | None, point: Point, accepted: Sequence[Candidate]) -> tuple[Data | None, float]:
+    """The held-out flights with the nuisances of this model, and its log-likelihood there."""
+    if held_out is None:
+        return None, 0.0
+    apart = held_out_twin(held_out, point, accepted)
+    return apart, held_out_fit(apart, point, accepted).loglik
+
+
 def _reset_conditional(point: Point, accepted: Sequence[Candidate], free: Nuisances) -> Point:
     """The point with effects that are not free in this model (`Prior.conditional`) reset to the vehicle file.
 

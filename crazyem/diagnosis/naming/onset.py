@@ -1,16 +1,17 @@
-"""Onset of effects that begin in mid-flight: detection and estimate of the time."""
+"""Onset of effects that begin in mid-flight: detection and estimate of the time; the fit of a found effect."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.fitting.fit import Data, Fitted
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.nuisances import refine_base
+from crazyem.diagnosis.fitting.nuisances import held_out_value, is_nonphysical, refine_base, refine_with_memory
+from crazyem.diagnosis.naming.detection_limits import is_implausible
 from crazyem.diagnosis.settings import SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
 
@@ -70,3 +71,30 @@ def date(data: Data, fitted: Fitted, candidate: Candidate) -> tuple[Fitted, Cand
         candidate = moved
         fitted = refine_base(data, fitted.point.with_effects({candidate.effect: {ONSET: begins}}), others, rounds=3)
     return fitted, candidate
+
+
+@dataclass(frozen=True)
+class Joined:
+    """The fit of a model with a found effect, all nuisances free; the held-out flights under it (`held_out_value`)."""
+
+    fitted: Fitted
+    held_out: Data | None
+    held_value: float
+
+
+def joined(
+    data: Data, held_out: Data | None, fit: Fitted, candidate: Candidate, accepted: Sequence[Candidate]
+) -> Joined | str:
+    """The model with one more effect, the last of its candidates, and its onset; or why the effect must stay out.
+
+    An effect at the end of its physical range stands for something else.
+    """
+    try:
+        dated, candidate = date(data, fit, candidate)
+        found = refine_with_memory(data, dated.point, [*accepted, candidate])
+        if is_implausible(found.point, candidate):
+            return "at the end of its physical range"
+        odd = is_nonphysical(found.point, found.candidates)  # then held-out flights are not asked
+        return Joined(found, *held_out_value(None if odd else held_out, found.point, found.candidates))
+    except DivergedError:
+        return "with it, the model leaves the range of numbers"

@@ -21,6 +21,7 @@ from crazyem.diagnosis.fitting.nuisances import (
     can_be_finding,
     held_out_fit,
     held_out_twin,
+    held_out_value,
     is_nonphysical,
     nuisances,
     refine_base,
@@ -28,9 +29,9 @@ from crazyem.diagnosis.fitting.nuisances import (
     with_nuisances,
     without,
 )
-from crazyem.diagnosis.naming.detection_limits import exceeds_limit, is_implausible
+from crazyem.diagnosis.naming.detection_limits import exceeds_limit
 from crazyem.diagnosis.naming.evidence import accepted_covariance, joint_gain, occam_cost
-from crazyem.diagnosis.naming.onset import date, onset_of
+from crazyem.diagnosis.naming.onset import joined, onset_of
 from crazyem.diagnosis.naming.prune import pruned
 from crazyem.diagnosis.naming.starting_points import best_starting_points
 from crazyem.diagnosis.naming.steady import steady_rivals, without_trim_rivals
@@ -148,14 +149,6 @@ class Basis:
     accepted: tuple[Candidate, ...]
     value: float
     held_value: float
-
-
-def held_out_value(held_out: Data | None, point: Point, accepted: Sequence[Candidate]) -> tuple[Data | None, float]:
-    """The held-out flights with the nuisances of this model, and its log-likelihood there."""
-    if held_out is None:
-        return None, 0.0
-    apart = held_out_twin(held_out, point, accepted)
-    return apart, held_out_fit(apart, point, accepted).loglik
 
 
 def fitted_trial(basis: Basis, trial: Trial, solution: Solution, *, say: Callable[[str], None]) -> Trial:
@@ -326,23 +319,18 @@ def select(
         if taken is None:
             break
         assert taken.fitted is not None
-        dated, candidate = date(data, taken.fitted, taken.candidate)
-        accepted.append(candidate)
-        say(f"  found {candidate.label}: {taken.evidence:.1f} nats")
-        before, fitted = fitted, refine_with_memory(data, dated.point, accepted)
-        if is_implausible(fitted.point, candidate):
-            # fitted with all nuisances, it is at the end of its physical range: it stands for something else
-            say(f"  left out again, at the end of its physical range: {candidate.label}")
-            accepted.pop()
+        say(f"  found {taken.candidate.label}: {taken.evidence:.1f} nats")
+        now = joined(data, held_out, taken.fitted, taken.candidate, accepted)
+        if isinstance(now, str):
+            say(f"  left out again, {now}: {taken.candidate.label}")
             steps.pop()
-            candidates = [c for c in candidates if c.effect != candidate.effect]
-            fitted = before
+            candidates = [c for c in candidates if c.effect != taken.candidate.effect]
             data.settle(fitted.point)
             continue
-        point, value = fitted.point, fitted.loglik
+        accepted, fitted = list(now.fitted.candidates), now.fitted
+        point, value, apart, held_value = fitted.point, fitted.loglik, now.held_out, now.held_value
         if is_nonphysical(point, accepted):  # `diagnose` reports that
             return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, reasons)
-        apart, held_value = held_out_value(held_out, point, accepted)
     found = {c.effect for c in accepted}
     whole = Selection(nominal, point, tuple(steps), tuple(accepted), fitted, reasons)
     chosen = pruned(data, whole, held_out, say)
