@@ -36,7 +36,7 @@ TRIMMED = replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}})
 @pytest.fixture(scope="module")
 def slow_to_turn():
     """Looks as if it were heavier to turn by 1/0.6, and is dragged."""
-    return fly(Hidden(torque=0.6, drag=(0.02, 0.02, 0.02)), seconds=20.0, seed=5)
+    return fly(Hidden(torque=0.6, drag=(0.02, 0.02, 0.02)), seconds=12.0, seed=5)
 
 
 @pytest.mark.slow
