@@ -52,8 +52,8 @@ test: $(WARM)  ## everything that is not marked slow
 slow: $(WARM)  ## the long ones: many seeds, many flights, and made-up examples that are many and new
 	$(BIN)/python -m pytest -q $(SHARED) -m "slow or hypothesis" --hypothesis-profile new
 
-slow-fixed: $(WARM)  ## the long ones alone
-	$(BIN)/python -m pytest -q $(SHARED) -m slow
+slow-fixed: $(WARM)  ## the long ones without those of the night
+	$(BIN)/python -m pytest -q $(SHARED) -m "slow and not nightly"
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -24,6 +24,7 @@ def test_the_table_says_what_came_out() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_the_velocity_errs_less_with_the_drag_and_the_height_with_mass_thrust() -> None:
     found = {name: flight() for name, flight in flights(SEED).items() if "drag" in name or "massThrust" in name}
     assert found["drag"]["error_m_s"] < 2 / 3 * found["no drag"]["error_m_s"]

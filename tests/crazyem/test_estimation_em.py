@@ -179,6 +179,7 @@ def fly_many(truth) -> tuple[np.ndarray, ...]:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("dither", [2e-4, 0.0], ids=["dither", "hover"])
 def test_intervals_cover_and_nothing_is_biased(dither):
     """40 flights of 5 s each: 95 % intervals cover, errors are no larger than promised, and their mean is near zero.

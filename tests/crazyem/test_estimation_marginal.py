@@ -176,6 +176,7 @@ SEEDS = 60
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("regime", ["quiet", "ordinary", "known"])
 def test_intervals_cover(regime):
     """One window of 2.5 s from each of 60 flights; with coverage 0.95, fewer than 52 hits of 60 happen once in 250."""

@@ -55,6 +55,7 @@ def test_offline_numbers_have_not_drifted() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_no_number_of_the_first_seed_has_drifted() -> None:
     """The estimator in the loop decides from update to update: its numbers are those of one numba and processor."""
     check([t for t in ALL if t.seed == 0 and t not in QUICK])

@@ -95,6 +95,7 @@ def test_damaged_files(files, name, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_many_damaged_files_in_little_memory(tmp_path):
     """In a process of their own, whose address space is capped once the libraries are loaded."""
     done = subprocess.run(
