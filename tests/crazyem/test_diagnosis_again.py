@@ -5,7 +5,6 @@ beside two weak rotors, a day's differences; on flights of `closed_loop.py`.
 """
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 from closed_loop import DRONE, Hidden, fly
@@ -145,9 +144,13 @@ def test_a_rotor_that_pushes_at_random_says_nothing_against_forces_that_last():
     assert confidence_factor(remains.without_random_rotor(1)) == CONFIDENCE.doubtful
     swinging = remains.with_finding(shaken)  # a loop that swings looks like a drag
     assert confidence_factor(swinging.without_random_rotor()) == CONFIDENCE.doubtful
-    data = SimpleNamespace(coarse=False)
+    data = Data([flight_of(fly(seconds=8.0), DRONE)])
+    point = nominal(data, Point(DRONE, {}, start_noise()))
     for name, rotor, against in (
         ("linear_drag", 0, False), ("inertia_products", 0, True), ("rotor_fault", 4, False), ("rotor_fault", 1, True),
     ):  # fmt: skip
-        candidate = Candidate(name, (("rotor", rotor),) if rotor else (), ("x",))
-        assert answer._against(remains, candidate, data).found == against  # type: ignore[arg-type]
+        free = {"inertia_products": "xy", "rotor_fault": "scale"}.get(name, "x")
+        candidate = Candidate(name, (("rotor", rotor),) if rotor else (), (free,))
+        assert answer._against(remains, candidate, data, point).found == against
+    for name, against in (("velocity_scale", False), ("gyro_bias", True), ("linear_drag", True)):
+        assert answer._against(swinging, Candidate(name, (), ("x",)), data, point).found == against

@@ -77,7 +77,7 @@ def answer_of(
         at = own.stop
         covariance = all_covariance[own, own]
         rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, selection, corroborated), balance)
-        against = _against(remains, candidate, data)
+        against = _against(remains, candidate, data, point)
         there = step.taken.presence(order)
         held = step.taken.held_out / step.taken.dispersion
         there *= confidence_factor(against, held) if step.taken.log_odds is None else 1.0
@@ -137,16 +137,23 @@ def strongest_first(effects: Sequence[Named], beside: Sequence[Named]) -> tuple[
     return tuple(ordered)
 
 
-def _against(remains: Unexplained, candidate: Candidate, data: Data) -> Unexplained:
+def _against(remains: Unexplained, candidate: Candidate, data: Data, point: Point) -> Unexplained:
     """The part of the unexplained structure that counts against an effect."""
     effect = CATALOGUE[candidate.effect]
-    if data.coarse and not effect.slow_torque:
-        remains = remains.of_forces()  # coarse flights: torques do not count against forces
+    coarse = data.coarse and not effect.slow_torque
+    if coarse or _of_pose(candidate, data, point):
+        remains = remains.of_forces()
     if effect.steady_force:
         return remains.without_random_rotor()
     if effect.imbalance == "rotor":  # a cut propeller is out of balance, too
         return remains.without_random_rotor(int(dict(candidate.fixed)["rotor"]))
     return remains
+
+
+def _of_pose(candidate: Candidate, data: Data, point: Point) -> bool:
+    """Whether an effect changes measured poses and velocities alone: then it imitates no torque."""
+    slopes = data.models[0].slopes(point, candidate.columns(point), data.workers)
+    return all(c.acting is None and c.showing is not None and not c.showing[:, 9:].any() for c in slopes)
 
 
 def _uncertainty(fitted: Fitted) -> tuple[NDArray, NDArray, NDArray]:

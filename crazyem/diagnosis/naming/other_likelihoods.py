@@ -66,10 +66,10 @@ def other_likelihoods(
                 values = {n: Value(float(a), "rad", float(e), interval_95(float(a), float(e)))
                           for n, a, e in zip(accelerometer.ANGLES, angles, sd, strict=True)}  # fmt: skip
                 dispersion = max(1.0, solution.dispersion)
-                there = presence(solution.gain / dispersion, held, solution.gain, dispersion=dispersion)
-                sure = confidence_factor(remains, held) * there  # the sensor measures a force that nothing explains
+                real = presence(solution.gain / dispersion, held, solution.gain, dispersion=dispersion)
+                sure = confidence_factor(remains, held) * real  # the sensor measures a force that nothing explains
                 name = accelerometer.EFFECT
-                found.append(Named(name, name, values, {}, held, sure, log_odds=float(logit(there))))
+                found.append(Named(name, name, values, {}, held, sure, log_odds=float(logit(real))))
     return found
 
 
