@@ -18,12 +18,13 @@ from crazyem.estimation.verdict import ROTATION_UNEXPLAINED, implausible_inertia
 from crazyem.live.policy import FaultRules
 from crazyem.monitoring.detector import Detector
 from crazyem.monitoring.fault import Fault
-from crazyem.monitoring.repetition import RunTest
+from crazyem.monitoring.repetition import Pair, RunTest
 from crazyem.notebook import finite
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle
 
-REPEATING = ("position", "velocity", "attitude", "body_rate")  # signals that a stuck sensor would repeat
+# Signals that a stuck sensor would repeat, each with its derivative and the scale of a pair
+REPEATING = {"position": ("velocity", 1.0), "attitude": ("body_rate", 0.5)}
 MOST_FAULTS = 1000  # most faults that are kept
 SHARE_OF_RUNS = 0.1  # share of the false alarms for the tests of repetition; the rest is for the detector
 
@@ -61,7 +62,11 @@ class FlightMonitor:
         self.on_fault = on_fault
         per_hour = rules.false_alarms_per_hour
         self._detector = Detector(vehicle, false_alarms_per_hour=(1.0 - SHARE_OF_RUNS) * per_hour)
-        self._runs = {name: RunTest(SHARE_OF_RUNS * per_hour / len(REPEATING)) for name in REPEATING}
+        self._pairs = {name: Pair(scale) for name, (_, scale) in REPEATING.items()}
+        self._pair_of = {rate: self._pairs[name] for name, (rate, _) in REPEATING.items()}
+        names = (*self._pairs, *self._pair_of)
+        self._runs = {name: RunTest(SHARE_OF_RUNS * per_hour / len(names)) for name in names}
+        self._stuck: dict[str, bool] = dict.fromkeys(names, False)
         self._broken = -math.inf  # s, last time at which the model did not hold
         self.faults: tuple[Fault, ...] = ()
         self.suspended = ""
@@ -77,11 +82,21 @@ class FlightMonitor:
 
     def take(self, sample: Sample, *, airborne: bool) -> None:
         """One sample, before the estimator gets it."""
-        test = self._runs.get(sample.signal)
-        if test is not None and test.add(sample.time, sample.value) and airborne:
+        test, name = self._runs.get(sample.signal), sample.signal
+        if test is None:
+            return
+        test.add(sample.time, sample.value)
+        begun = test.since == sample.time
+        moved = (
+            self._pairs[name].add_value(sample.value, begun=begun)
+            if name in self._pairs
+            else self._pair_of[name].add_rate(sample.time, sample.value, begun=begun)
+        )
+        before, self._stuck[name] = self._stuck[name], test.alarmed and (moved or (self._stuck[name] and not begun))
+        if self._stuck[name] and not before and airborne:
             self._report(
                 Fault(
-                    effect=f"stuck {sample.signal}", rotor=None, text=f"the {sample.signal.replace('_', ' ')} is stuck",
+                    effect=f"stuck {name}", rotor=None, text=f"the {name.replace('_', ' ')} is stuck",
                     onset=test.since, detected=sample.time, sizes={}, probability=1.0, look_alikes={}, settled=True,
                 )
             )  # fmt: skip
@@ -91,7 +106,7 @@ class FlightMonitor:
         if self.rules.action == "report":
             return ""
         followed = bool(self.faults) and self.faults[-1].followed
-        if self._stuck or not (self._detector.holds or followed):
+        if any(self._stuck.values()) or not (self._detector.holds or followed):
             self._broken = time
         if time - self._broken <= self.rules.resume:
             return "the model of the flight does not hold: " + (self.faults[-1].name if self.faults else "a change")
@@ -105,10 +120,6 @@ class FlightMonitor:
     def tested(self) -> float:
         """s of flight in which the detector has tested."""
         return self._detector.tested
-
-    @property
-    def _stuck(self) -> bool:
-        return any(test.alarmed for test in self._runs.values())
 
     def _filtered(self, em: WindowEM, p: Parameters, first: int, last: int, sd: NDArray[np.float64] | None) -> None:
         # innovations about a model that does not describe the rotation say nothing of faults

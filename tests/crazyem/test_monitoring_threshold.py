@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crazyem.monitoring.repetition import RunTest
+from crazyem.monitoring.repetition import Pair, RunTest
 from crazyem.monitoring.threshold import crossing_rate, threshold_for
 
 
@@ -75,3 +75,42 @@ def test_a_drone_that_rests_now_and_then_is_not_stuck() -> None:
 def test_a_gap_is_no_repetition() -> None:
     test = RunTest(0.01)
     assert not any(test.add(float(k), (1.0, 2.0)) for k in range(200))
+
+
+@given(
+    speed=st.floats(0.0, 2.0),
+    quantum=st.sampled_from((1e-3, 1e-4)),
+    stuck=st.sampled_from(("", "value", "rate")),
+    rate_known=st.booleans(),
+)
+def test_a_signal_is_stuck_only_where_its_pair_has_moved(
+    speed: float, quantum: float, stuck: str, rate_known: bool
+) -> None:
+    """A position along a line and its velocity, in whole quanta, for 1 s; one of them is stuck from 0.5 s on."""
+
+    def rounded(x: float) -> tuple[float, ...]:
+        return (round(x / quantum) * quantum,)
+
+    pair, value_moves, rate_misses = Pair(1.0), False, False
+    last = {"value": rounded(0.0), "rate": rounded(0.0)}
+    for k in range(100):
+        time, begins = 0.01 * k, k == 50
+        velocity = speed * (1.0 if k < 50 else 2.0)  # so that a stuck velocity is wrong, too
+        true = {"value": rounded(0.01 * speed * (min(k, 50) + 2.0 * max(k - 50, 0))), "rate": rounded(velocity)}
+        last = {n: last[n] if n == stuck and k > 50 else v for n, v in true.items()}
+        if begins and stuck == "rate":
+            last["rate"] = rounded(speed)
+        value_moves = pair.add_value(last["value"], begun=begins)
+        if rate_known:
+            rate_misses = pair.add_rate(time, last["rate"], begun=begins)
+    if not rate_known:
+        assert value_moves  # nothing says that it rests
+        return
+    moved = speed * 0.49 > 4.0 * quantum
+    rests = speed * 2.0 < 0.4 * quantum
+    if stuck == "value" and (moved or rests):
+        assert value_moves == moved
+    if stuck == "rate" and (moved or rests):
+        assert rate_misses == moved
+    if not stuck:
+        assert not rate_misses
