@@ -80,7 +80,6 @@ class Pair:
         self._scale = scale
         self._resolution = 0.0  # of the signal: its smallest change so far
         self._value: tuple[float, ...] = ()
-        self._rate: tuple[float, ...] = ()
         self._path: tuple[float, ...] = ()  # integral of the derivative
         self._time = -math.inf  # of the newest derivative
         self._path_before: tuple[float, ...] = ()  # when the run of the signal began
@@ -104,7 +103,7 @@ class Pair:
         step = time - self._time
         step = step if 0.0 < step < LONGEST_GAP else 0.0
         path = self._path or (0.0,) * len(rate)
-        self._path, self._time, self._rate = tuple(p + step * r for p, r in zip(path, rate)), time, rate
+        self._path, self._time = tuple(p + step * r for p, r in zip(path, rate)), time
         if begun:
             self._before = (self._value, time)
         if not self._value:

@@ -74,7 +74,7 @@ def date(data: Data, fitted: Fitted, candidate: Candidate) -> tuple[Fitted, Cand
 
 
 @dataclass(frozen=True)
-class Joined:
+class Extension:
     """The fit of a model with a found effect, all nuisances free; the held-out flights under it (`held_out_value`)."""
 
     fitted: Fitted
@@ -82,9 +82,9 @@ class Joined:
     held_value: float
 
 
-def joined(
+def extend(
     data: Data, held_out: Data | None, fit: Fitted, candidate: Candidate, accepted: Sequence[Candidate]
-) -> Joined | str:
+) -> Extension | str:
     """The model with one more effect, the last of its candidates, and its onset; or why the effect must stay out.
 
     An effect at the end of its physical range stands for something else.
@@ -95,6 +95,6 @@ def joined(
         if is_implausible(found.point, candidate):
             return "at the end of its physical range"
         odd = is_nonphysical(found.point, found.candidates)  # then held-out flights are not asked
-        return Joined(found, *held_out_value(None if odd else held_out, found.point, found.candidates))
+        return Extension(found, *held_out_value(None if odd else held_out, found.point, found.candidates))
     except DivergedError:
         return "with it, the model leaves the range of numbers"

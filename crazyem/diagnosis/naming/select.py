@@ -31,7 +31,7 @@ from crazyem.diagnosis.fitting.nuisances import (
 )
 from crazyem.diagnosis.naming.detection_limits import exceeds_limit
 from crazyem.diagnosis.naming.evidence import accepted_covariance, joint_gain, occam_cost
-from crazyem.diagnosis.naming.onset import joined, onset_of
+from crazyem.diagnosis.naming.onset import extend, onset_of
 from crazyem.diagnosis.naming.prune import pruned
 from crazyem.diagnosis.naming.starting_points import best_starting_points
 from crazyem.diagnosis.naming.steady import steady_rivals, without_trim_rivals
@@ -320,15 +320,15 @@ def select(
             break
         assert taken.fitted is not None
         say(f"  found {taken.candidate.label}: {taken.evidence:.1f} nats")
-        now = joined(data, held_out, taken.fitted, taken.candidate, accepted)
-        if isinstance(now, str):
-            say(f"  left out again, {now}: {taken.candidate.label}")
+        extension = extend(data, held_out, taken.fitted, taken.candidate, accepted)
+        if isinstance(extension, str):
+            say(f"  left out again, {extension}: {taken.candidate.label}")
             steps.pop()
             candidates = [c for c in candidates if c.effect != taken.candidate.effect]
             data.settle(fitted.point)
             continue
-        accepted, fitted = list(now.fitted.candidates), now.fitted
-        point, value, apart, held_value = fitted.point, fitted.loglik, now.held_out, now.held_value
+        accepted, fitted = list(extension.fitted.candidates), extension.fitted
+        point, value, apart, held_value = fitted.point, fitted.loglik, extension.held_out, extension.held_value
         if is_nonphysical(point, accepted):  # `diagnose` reports that
             return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, reasons)
     found = {c.effect for c in accepted}
