@@ -81,6 +81,12 @@ def test_a_yaw_that_nothing_shows_is_no_tilt(recording, monkeypatch, roll, held,
     remains = Unexplained((), 0.0)
     found = other_likelihoods(data, None, point, remains, [accelerometer.EFFECT], {}, False, lambda text: None)
     assert [f.name for f in found] == [accelerometer.EFFECT] * told
+    left = Finding("force", "z", "z position", "z", (0.0, 9.0), 5e-3, 5e-4, "N", 250.0, 1e-9)
+    beside = Unexplained((left,), 0.0)
+    doubtful = other_likelihoods(data, None, point, beside, [accelerometer.EFFECT], {}, False, lambda text: None)
+    for one, other in zip(found, doubtful, strict=True):
+        assert other.confidence == pytest.approx(CONFIDENCE.doubtful * one.confidence)
+        assert other.log_odds == one.log_odds
 
 
 def test_a_yaw_that_was_not_seen_does_not_cost_what_the_tilt_brings(recording):

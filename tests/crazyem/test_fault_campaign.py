@@ -117,6 +117,19 @@ def test_the_table(benches, tmp_path):
     assert table["none"]["faults"] == {"stall": 2}
 
 
+def test_a_later_case_has_the_same_faults_later(benches):
+    _, flight = benches
+    for seed in range(100):
+        case = flight.draw(seed)
+        later = case.later(8.0)
+        assert later.kinds == case.kinds
+        assert (later.sensor_from - 8.0, later.stall_at - 8.0) == pytest.approx((case.sensor_from, case.stall_at))
+        assert [t - 8.0 for t, _ in later.payload] == pytest.approx([t for t, _ in case.payload])
+        for one, other in zip(case.link, later.link, strict=True):
+            assert {n: v + 8.0 if n in ("start", "end") else v for n, v in one.items()} == other
+        assert case.later(0.0) == case
+
+
 def test_the_monitor_observes_the_estimator_of_a_campaign(benches):
     _, flight = benches
     vehicle = load_vehicle("cf2")

@@ -134,6 +134,20 @@ def test_a_signal_that_sticks_is_named_and_stops_pushing(flight: list[Sample]) -
     assert monitor.stops(SECONDS)
 
 
+@pytest.mark.parametrize(("speed", "stuck"), [(0.0, False), (0.5, True)])
+def test_a_quiet_hover_is_no_stuck_position(speed: float, stuck: bool) -> None:
+    """A climb in millimetres, then 5 s of the same position; the velocity says that the drone rests, or that not."""
+    reports: list[Fault] = []
+    monitor = FlightMonitor(VEHICLE, FaultRules(), on_fault=reports.append)
+    for k in range(700):
+        climbs, time = k < 200, 0.01 * k
+        velocity = (0.0, 0.0, 0.3) if climbs else (speed, 0.001 * (k % 2), 0.0)
+        for signal, value in (("position", (0.0, 0.0, round(3e-3 * min(k, 200), 3))), ("velocity", velocity)):
+            monitor.take(Sample(signal, time, value), airborne=True)
+    assert [f.effect for f in reports] == ["stuck position"] * stuck
+    assert bool(monitor.stops(7.0)) is stuck
+
+
 def test_the_columns_of_rotors_are_what_the_rotors_do() -> None:
     vehicle = load_vehicle("cf2")
     random = np.random.default_rng(1)
