@@ -28,8 +28,8 @@ from .ideal import best_fit, known_effects, options_of
 from .paths import FLIGHTS, Study, read, write
 from .report import unhidden
 
-LEAST = 4  # recordings, below which a nuisance is not in the table
-INFORMED = 0.995  # of the prior's standard deviation; a value that is known no better says nothing
+MIN_RECORDINGS = 4  # of a nuisance in the table
+MAX_SD = 0.995  # of the prior's standard deviation; a value that is known no better says nothing
 
 Row = dict[str, Any]
 
@@ -99,8 +99,8 @@ def table(study: Study) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for (name, parameter, onboard), rows in sorted(of.items()):
-        informed = [r for r in rows if r["sd"] < INFORMED]
-        if len(informed) < LEAST:
+        informed = [r for r in rows if r["sd"] < MAX_SD]
+        if len(informed) < MIN_RECORDINGS:
             continue
         mean, sd, gain = spread(*(np.array([r[k] for r in informed]) for k in ("value", "sd")))
         usual = np.median([r["usual"] for r in informed])
