@@ -83,7 +83,7 @@ def test_a_prior_after_a_step_is_never_wider_than_the_first_one(sd):
     assert np.all(found.prior.sd <= first.prior.sd)
     same = found.prior.sd == first.prior.sd
     assert np.all(found.prior.centre[same] == first.prior.centre[same])
-    assert np.all(found.prior.sd[~same] >= np.array(sd)[~same])
+    assert np.all(found.prior.sd[~same] >= np.array(sd)[~same] * (1.0 - 1e-12))  # up to rounding
 
 
 def test_where_nothing_steps_nothing_changes():
