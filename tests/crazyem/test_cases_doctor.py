@@ -1,4 +1,4 @@
-"""Strangers' files on which the commands were wrong: what info, doctor, replay and diagnose must say of them."""
+"""Strangers' files on which the commands were wrong: what they must say of them, or why they refuse them."""
 
 import json
 from dataclasses import replace
@@ -10,9 +10,11 @@ from hypothesis import strategies as st
 
 from crazyem.cli import main
 from crazyem.doctor import Finding, Grade, examine
+from crazyem.errors import FileFormatError
 from crazyem.recordings import ReadOptions, Recording, open_recording
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.finding import percent
+from crazyem.recordings.parts import open_parts
 
 CASES = Path(__file__).parent / "cases"
 
@@ -91,13 +93,6 @@ def test_a_fixed_wing_is_no_quadrotor_to_any_command(capsys: pytest.CaptureFixtu
         assert "fixed wing aircraft, by its autopilot; the models here are of quadrotors" in refused(capsys, *command)
 
 
-def test_no_battery_monitor_is_harmless() -> None:
-    recording = opened("tlog_no_battery_monitor", "a.tlog")
-    about = [f for f in examine(recording) if f.signal == "voltage" or "voltage" in f.text]
-    assert [f.grade for f in about] == [Grade.HARMLESS]
-    assert "no battery monitor is connected" in about[0].text
-
-
 @pytest.mark.parametrize("counted", [True, False])
 def test_a_rate_that_changes_is_no_loss(counted: bool) -> None:
     """By the sequence numbers, and by the intervals alone."""
@@ -141,3 +136,35 @@ def test_a_share_is_never_a_power_of_ten(share: float) -> None:
     assert "e" not in text.replace("under", "")
     if "under" not in text:
         assert float(text.removesuffix(" %")) == pytest.approx(100.0 * share, rel=0.051, abs=0.5)
+
+
+def test_erased_flash_after_the_last_record_is_not_read() -> None:
+    path = CASES / "usd_ff_tail" / "log00"
+    recording = open_recording(path)
+    assert recording.duration == pytest.approx(5.99)
+    assert {array.time.size for array in recording.signals.values()} == {600}
+    (finding,) = [f for f in recording.findings if f.check == "integrity"]
+    assert finding.evidence["offset_bytes"] == 22922
+    assert "0xFF" in finding.text
+    parts = list(open_parts(path, seconds=1.0))
+    assert sum(len(part) for part in parts) == len(recording)
+    assert [f.text for part in parts for f in part.findings] == [finding.text]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("lfs_pointer/flight.mcap", "git lfs pull"), ("dataflash_bin/log.BIN", "mavlogdump.py --format csv")],
+)
+def test_refusals_say_what_the_file_is_and_what_to_do(name: str, words: str) -> None:
+    with pytest.raises(FileFormatError, match=words):
+        open_recording(CASES / name)
+
+
+def test_a_folder_of_pointers_is_not_empty_without_a_word(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pointer = (CASES / "lfs_pointer" / "flight.mcap").read_bytes()
+    for name in ("a.mcap", "b.ulg", "picture.png"):
+        (tmp_path / name).write_bytes(pointer)
+    assert main(["info", str(tmp_path), "--jobs", "1"]) == FileFormatError.exit_code
+    said = capsys.readouterr().err
+    assert said.count("git lfs pull") == 2
+    assert "picture.png" not in said

@@ -14,6 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.generator.mavcrc import x25crc
 from scipy.spatial.transform import Rotation
 
+from crazyem.doctor import Grade, examine
 from crazyem.errors import CrazyemError, FileFormatError
 from crazyem.recordings.autopilots.tlog_file import read, recognises
 from crazyem.recordings.contents import ReadOptions
@@ -411,7 +412,9 @@ def test_a_battery_monitor_that_reads_zero_is_not_connected(tmp_path: Path) -> N
     recording = opened(tmp_path, log.bytes)
     assert "voltage" not in recording.signals
     assert "no battery monitor" in recording.metadata["not_measured"]["voltage"]
-    assert [f.signal for f in recording.findings if f.signal] == ["voltage"]
+    (about,) = [f for f in examine(recording) if f.signal == "voltage" or "voltage" in f.text]
+    assert about.grade is Grade.HARMLESS
+    assert "no battery monitor is connected" in about.text
 
 
 def test_an_autopilot_that_was_started_again_makes_two_parts_on_one_axis(tmp_path: Path) -> None:

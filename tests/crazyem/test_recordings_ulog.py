@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from crazyem.cli import main
 from crazyem.errors import FileFormatError
 from crazyem.recordings.autopilots.ulog_file import read, recognises
 from crazyem.recordings.contents import ReadOptions
@@ -397,3 +398,11 @@ def test_a_topic_without_any_stamps_says_so(tmp_path: Path) -> None:
     assert "voltage" not in recording.signals
     (finding,) = [f for f in recording.findings if f.check == "stamps"]
     assert "battery_status has no stamps" in finding.text
+
+
+def test_what_was_read_without_wild_stamps_is_written_without_them(tmp_path: Path) -> None:
+    path, fixed = save(tmp_path, with_stamps(as_stamped, {20: 10**15})), tmp_path / "fixed.mcap"
+    assert main(["doctor", str(path), "--fix", "-o", str(fixed)]) == 0
+    again = open_recording(fixed)
+    np.testing.assert_array_equal(again.signals["body_rate"].time, open_recording(path).signals["body_rate"].time)
+    assert not [f for f in again.findings if f.check == "stamps"]
