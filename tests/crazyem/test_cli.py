@@ -4,12 +4,16 @@ import json
 import socket
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
 from crazyem.cli import main, parser
+from crazyem.commands.common import compile_kernels
 from crazyem.control.named_trajectories import trajectory_maker
 from crazyem.errors import UsageError
+from crazyem.live import warm_up
+from crazyem.vehicle import load_vehicle
 
 NANOBENCH = "nanobench/B3_figure8_medium_rep1.csv.gz"
 
@@ -176,3 +180,32 @@ def test_a_plot_is_written_only_beside_a_file_that_was_asked_for():
     assert plot_path(Namespace(plot=None), None, "-") is None
     assert plot_path(Namespace(plot=None), "a/f.csv.gz", "b.json") == "a/f.png"
     assert plot_path(Namespace(plot="p.png"), None, "b.json") == "p.png"
+
+
+# --- whether something was compiled is counted, not told by the clock: a slow start is no compilation ---
+
+
+def test_a_start_from_the_disk_says_nothing_however_slow(monkeypatch, capsys) -> None:
+    vehicle = load_vehicle("cf2")
+    warm_up.warm_up(vehicle)
+    clock = iter((0.0, 60.0))
+    monkeypatch.setattr(warm_up, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    compile_kernels(vehicle)
+    assert "compiled" not in "".join(capsys.readouterr())
+
+
+def test_a_compilation_is_told(monkeypatch, capsys) -> None:
+    counts = iter((0, 3))
+    monkeypatch.setattr(warm_up, "compilations", lambda: next(counts))
+    compile_kernels(load_vehicle("cf2"))
+    assert "compiled the estimator in" in "".join(capsys.readouterr())
+
+
+def test_defaults_and_limits(capsys: pytest.CaptureFixture[str]) -> None:
+    fly = parser().parse_args(["fly"])
+    watch = parser().parse_args(["watch", "udp://127.0.0.1:1"])
+    assert (fly.rate, fly.reconnect) == (1000.0 / 11.0, 8.0)
+    assert (watch.rate, watch.reconnect) == (1000.0 / 11.0, 30.0)
+    for option in (["--rate", "1001"], ["--rate", "0"], ["--rate", "nan"], ["--reconnect", "-1"]):
+        assert main(["fly", *option]) == 2
+        assert capsys.readouterr().err.startswith(f"crazyem: argument {option[0]}")

@@ -75,9 +75,11 @@ def test_a_whole_set():
 def test_a_set_that_breaks_anywhere_is_undone_completely(at, applied):
     """All attempts at write `at` go unanswered, whether it arrived or not; then the drone answers again."""
     drone = Drone(lambda n: at < n <= at + WRITE_ATTEMPTS, applied)
-    guard, history, done, pusher = run(drone, a_set(), a_set())
+    attempts = []
+    guard, history, done, pusher = run(drone, a_set(), a_set(), on_write=attempts.append)
     assert drone.values == ORIGINALS
     assert pusher.known == ORIGINALS
+    assert len(attempts) == drone.attempts
     assert done == [("push", False), ("push", False)]
     assert "not confirmed" in guard.stopped
     assert any("undone" in n for n in history.notices)

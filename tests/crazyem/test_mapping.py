@@ -382,7 +382,7 @@ def test_nanobench_voltage_has_its_own_samples_back(shared_recordings):
         time = table["t"].to_numpy() - recording.origin
         inside = (time >= voltage.time[0]) & (time <= voltage.time[-1])
         drawn = np.interp(time, voltage.time, voltage.value[:, 0])[inside]
-        # the limit of corners(), see test_interpolation; all but a few rows agree to the rounding of the file
+        # the limit of corners(), see test_recordings_csv; all but a few rows agree to the rounding of the file
         error = np.abs(drawn - table["pwr_pm_vbat"][inside])
         assert error.max() < 1.05e-8
         assert np.quantile(error, 0.99) < 2e-9
