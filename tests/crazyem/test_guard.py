@@ -23,10 +23,10 @@ ORIGINALS = {
 }  # fmt: skip
 
 
-def estimate(time=0.0, *, relative_sd=0.003, identifiable=True, reason="", **values):
+def estimate(time=0.0, *, relative_sd=0.003, identifiable=True, reason="", truth=TRUTH, **values):
     parameters = {}
-    for name, unit in PARAMETER_UNITS.items():
-        v = values.get(name, TRUTH.get(name, 0.05))
+    for name, unit in {**PARAMETER_UNITS, **dict.fromkeys(values, "")}.items():
+        v = values.get(name, truth.get(name, 0.05))
         sd = relative_sd * abs(v)
         parameters[name] = ParameterEstimate(v, sd, (v - 1.96 * sd, v + 1.96 * sd), unit, identifiable, reason)
     return Estimate(time, parameters)

@@ -6,8 +6,7 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from received import packets, wait_for
-from relayed import connected
+from relayed import connected, packets, wait_for
 
 from crazyem.errors import LinkError, UsageError
 from crazyem.links import open_link

@@ -12,7 +12,7 @@ import pytest
 from autopilots import ARDUPILOT, PX4, FakeAutopilot
 from mavlink_pilot import free_port
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from received import wait_for
+from relayed import wait_for
 
 from crazyem.errors import LinkError, UsageError
 from crazyem.links import open_link

@@ -87,21 +87,19 @@ def test_a_set_that_breaks_anywhere_is_undone_completely(at, applied):
     assert sum(p.verified for p in history.pushes) == len(drone.log) - (WRITE_ATTEMPTS if applied else 0)
 
 
-def test_one_lost_echo_is_tried_again():
-    drone = Drone(lambda n: n == 3)
-    guard, _, done, _ = run(drone, a_set())
+@pytest.mark.parametrize(
+    ("lost", "outage"), [((3,), False), ((5, 6, 7), True)], ids=["one echo", "three, with the link"]
+)
+def test_lost_echoes_are_asked_for_again(lost, outage):
+    """The link goes in the third attempt at the fifth write, is noticed to be gone only then, and comes back.
+
+    An attempt during which the link was lost counts for nothing.
+    """
+    drone = Drone(lambda n: n in lost)
+    guard, _, done, _ = run(drone, a_set(), outages=lambda: int(outage and drone.attempts >= lost[-1]))
     assert done == [("push", True)]
     assert not guard.stopped
-    assert drone.attempts == len(a_set().writes) + 1
-
-
-def test_an_attempt_during_which_the_link_was_lost_counts_for_nothing():
-    """The link goes in the third attempt at the fifth write, is noticed to be gone only then, and comes back."""
-    drone = Drone(lambda n: 5 <= n <= 7)
-    guard, _, done, _ = run(drone, a_set(), outages=lambda: int(drone.attempts >= 7))
-    assert done == [("push", True)]
-    assert not guard.stopped
-    assert drone.attempts == len(a_set().writes) + 3
+    assert drone.attempts == len(a_set().writes) + len(lost)
 
 
 def test_a_link_that_keeps_going_does_not_keep_a_write_for_ever():

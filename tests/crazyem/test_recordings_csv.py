@@ -328,14 +328,6 @@ def test_parts_joined_are_the_whole(tmp_path_factory, seed, seconds):
     same(parts, whole)
 
 
-def test_parts_of_a_real_flight(shared_recordings):
-    path = shared_recordings / "nanobench" / "B3_figure8_medium_rep1.csv.gz"
-    whole = csv_file.read(path, ReadOptions())
-    parts = list(csv_file.read_parts(path, ReadOptions(), 4.0))
-    assert len(parts) == 7
-    same(parts, whole)
-
-
 # --- the real ones --------------------------------------------------------------------------------------------------
 
 
