@@ -44,7 +44,7 @@ def recordings(draw: st.DrawFn, names: st.SearchStrategy[str], words: st.SearchS
             clocks[stream], f"{stream} {named[stream]}", tuple(draw(st.lists(words, max_size=2))),
         )  # fmt: skip
     metadata = draw(st.dictionaries(words, st.dictionaries(words, words, max_size=2), max_size=2))
-    found = tuple(draw(st.lists(findings(words, chosen[0]), max_size=2)))
+    found = tuple(draw(st.lists(findings(words, chosen[0]), max_size=2, unique_by=lambda f: f.text)))
     happened = tuple(draw(st.lists(events(words), max_size=3)))
     return Recording("there", draw(words), signals, metadata, found, happened, draw(st.floats(-1e9, 1e9)))
 

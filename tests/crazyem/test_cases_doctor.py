@@ -17,11 +17,11 @@ from crazyem.recordings.finding import percent
 from crazyem.recordings.parts import open_parts
 
 CASES = Path(__file__).parent / "cases"
+MAP = CASES / "map.toml"
 
 
-def opened(case: str, name: str, mapping: str | None = None) -> Recording:
-    folder = CASES / case
-    return open_recording(folder / name, ReadOptions(str(folder / mapping) if mapping else None))
+def opened(case: str, name: str, mapping: Path | None = None) -> Recording:
+    return open_recording(CASES / case / name, ReadOptions(str(mapping) if mapping else None))
 
 
 def found(recording: Recording, check: str) -> list[Finding]:
@@ -42,14 +42,14 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 
 def test_a_drone_that_is_carried_off_its_table_does_not_fly() -> None:
-    recording = opened("mocap_table_then_carried", "flight.csv.gz", "map.toml")
+    recording = opened("mocap_table_then_carried", "flight.csv.gz", MAP)
     ((begin, end),) = airtime(recording).flown
     assert (begin, end) == pytest.approx((8.3, 26.4), abs=0.15)
     assert not found(recording, "flight")  # one flight, seen whole
 
 
 def test_a_leap_of_position_is_found_and_marked(tmp_path: Path) -> None:
-    recording = opened("position_jump_cm", "flight.csv.gz", "map.toml")
+    recording = opened("position_jump_cm", "flight.csv.gz", MAP)
     leap, coarse = found(recording, "numbers")
     assert leap.grade is Grade.DEGRADES
     assert leap.intervals[0] == pytest.approx((15.0, 15.04), abs=0.011)
@@ -60,25 +60,24 @@ def test_a_leap_of_position_is_found_and_marked(tmp_path: Path) -> None:
     assert coarse.grade is Grade.HARMLESS
     assert coarse.evidence["resolution_m"] == pytest.approx(0.01)
     fixed = tmp_path / "fixed.mcap"
-    path, mapping = CASES / "position_jump_cm" / "flight.csv.gz", CASES / "position_jump_cm" / "map.toml"
-    assert main(["doctor", str(path), "--map", str(mapping), "--fix", "-o", str(fixed)]) == 0
+    path = CASES / "position_jump_cm" / "flight.csv.gz"
+    assert main(["doctor", str(path), "--map", str(MAP), "--fix", "-o", str(fixed)]) == 0
     assert [f.grade for f in found(open_recording(fixed), "numbers")] == [Grade.HARMLESS]
 
 
 @pytest.mark.parametrize(
-    ("mapping", "signal", "unit"),
-    [
-        ("map_us.toml", "motor_request", 'unit = "us"'),
-        ("map_counts.toml", "motor_request", 'unit = "pwm"'),
-        ("map_duty_counts.toml", "motor_command", 'unit = "pwm"'),
-    ],
+    ("column", "signal", "unit"),
+    [("u0", "motor_request", "us"), ("m1", "motor_request", "pwm"), ("m1", "motor_command", "pwm")],
 )
-def test_a_request_in_another_unit_is_no_saturation(mapping: str, signal: str, unit: str) -> None:
+def test_a_request_in_another_unit_is_no_saturation(tmp_path: Path, column: str, signal: str, unit: str) -> None:
+    mapping, first = tmp_path / "map.toml", int(column[1])
+    columns = [f"{column[0]}{i}" for i in range(first, first + 4)]
+    mapping.write_text(f'{MAP.read_text()}[signals.{signal}]\ncolumns = {json.dumps(columns)}\nunit = "1"\n')
     recording = opened("request_in_wrong_unit", "flight.csv.gz", mapping)
     (finding,) = found(recording, "numbers")
     assert (finding.grade, finding.signal) == (Grade.UNUSABLE, signal)
     assert "outside 0..1 in 3000 of 3000" in finding.text
-    assert unit in finding.advice
+    assert f'unit = "{unit}"' in finding.advice
     assert not found(recording, "saturation")
 
 

@@ -1,6 +1,5 @@
 """The command line: options, exit codes, and one clear sentence for everything a user can get wrong."""
 
-import json
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -9,14 +8,12 @@ import pytest
 from mavlink_pilot import free_port
 from recording_files import fails
 
-from crazyem.cli import main, parser
+from crazyem.cli import parser
 from crazyem.commands.common import compile_kernels
 from crazyem.control.named_trajectories import trajectory_maker
 from crazyem.errors import UsageError
 from crazyem.live import warm_up
 from crazyem.vehicle import load_vehicle
-
-NANOBENCH = "nanobench/B3_figure8_medium_rep1.csv.gz"
 
 
 def test_help_is_quick_and_imports_nothing_heavy():
@@ -128,32 +125,6 @@ def test_a_file_that_is_no_recording(capsys, tmp_path, content):
     path = tmp_path / "notes.txt"
     path.write_bytes(content)
     assert "notes.txt" in fails(capsys, "replay", path, code=3)
-
-
-def test_replay_of_a_real_recording(capsys, tmp_path, shared_recordings):
-    out = tmp_path / "r.json"
-    words = ["replay", str(shared_recordings / NANOBENCH), "--vehicle", "cf2", "--to", "8", "--every", "40"]
-    assert main([*words, "--json", str(out)]) == 0
-    summary = json.loads(out.read_text())
-    assert set(summary["estimates"]) >= {"mass", "Ixx", "Iyy", "Izz", "motor_time_constant"}
-    assert {"value", "sd", "ci95", "unit", "identifiable", "reason"} <= set(summary["estimates"]["mass"])
-    assert any("thrust scale" in n for n in summary["notices"])
-    assert (tmp_path / "r.png").stat().st_size > 10_000
-    assert "mass" in capsys.readouterr().out
-
-
-def test_nan_in_a_recording_is_named(capsys, tmp_path, shared_recordings):
-    import gzip
-
-    lines = gzip.decompress((shared_recordings / NANOBENCH).read_bytes()).decode().splitlines()
-    header = lines[0].split(",")
-    fields = lines[400].split(",")
-    fields[next(i for i, n in enumerate(header) if "vbat" in n.lower())] = "nan"
-    lines[400] = ",".join(fields)
-    path = tmp_path / "damaged.csv"
-    path.write_text("\n".join(lines) + "\n")
-    said = fails(capsys, "replay", path, "--vehicle", "cf2", code=5)
-    assert "voltage is not a number" in said
 
 
 def test_trajectory_maker_reads_the_waypoints_at_once(tmp_path):

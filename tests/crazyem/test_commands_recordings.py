@@ -277,6 +277,7 @@ def test_nothing_is_replaced_unless_asked_and_never_an_input(
         (["recover", "none.mcap", "-o", "x.mcap"], "none.mcap"),
         (["recover", "{f}", "-o", "{f}"], "never written in place"),
         (["layout", "-o", "no/such/folder/x.json"], "cannot write"),
+        (["layout", "-o", "{f}"], "exists already"),
     ],
 )
 def test_wrong_usage_is_one_sentence(
@@ -307,13 +308,3 @@ def test_recover_a_cut_recording(capsys: pytest.CaptureFixture[str], tmp_path: P
     assert "exists already" in fails(capsys, "recover", broken, "-o", target, code=2)
     (tmp_path / "n.mcap").write_bytes(b"not an MCAP file")
     assert "n.mcap" in fails(capsys, "recover", tmp_path / "n.mcap", "-o", tmp_path / "m.mcap", code=3)
-
-
-def test_layout_is_json(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    code, out, _ = run(capsys, "layout")
-    assert code == 0
-    assert json.loads(out)["configById"]
-    target = tmp_path / "layout.json"
-    assert run(capsys, "layout", "-o", target)[0] == 0
-    assert json.loads(target.read_text()) == json.loads(out)
-    assert "exists already" in fails(capsys, "layout", "-o", target, code=2)

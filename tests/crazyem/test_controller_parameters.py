@@ -53,14 +53,7 @@ def guard_of(controller, vehicle=CF2, **originals):
 
 
 def decided(guard, seconds=8.0, make=estimate, judged=True):
-    out = []
-    for i in range(int(seconds / 0.04)):
-        d = guard.consider(make(0.04 * i), 0.04 * i, airborne=True)
-        if d.writes:
-            out.append(d)
-            if judged:
-                guard.trust()
-    return out
+    return test_guard.run(guard, seconds, make=make, judged=judged)
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.5])

@@ -32,12 +32,15 @@ def estimate(time=0.0, *, relative_sd=0.003, identifiable=True, reason="", truth
     return Estimate(time, parameters)
 
 
-def run(guard, *, seconds=10.0, dt=0.04, airborne=True, enabled=True, make=estimate):
+def run(guard, seconds=10.0, *, dt=0.04, airborne=True, enabled=True, make=estimate, judged=False):
+    """Decisions to write; `judged`: each was good."""
     out = []
     for i in range(int(seconds / dt)):
         d = guard.consider(make(i * dt), i * dt, airborne=airborne, enabled=enabled)
         if d.writes:
             out.append(d)
+            if judged:
+                guard.trust()
     return out
 
 

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from crazyem.cli import main
 from crazyem.commands import layout as command
 from crazyem.errors import UsageError
 from crazyem.recordings.mcap import schemas
@@ -129,6 +130,10 @@ def test_the_command_takes_names_from_words_or_a_swarm_file(tmp_path, capsys):
     assert told(swarm=str(swarm)) == swarm_layout(["left", "drone1"])
     assert told(drones=["a", "b"]) == swarm_layout(["a", "b"])
     assert told() == foxglove_layout()
+    out = tmp_path / "layout.json"
+    assert main(["layout", "-o", str(out)]) == 0
+    assert json.loads(out.read_text()) == foxglove_layout()
+    capsys.readouterr()
     for words in ({"drones": ["a", "a"]}, {"drones": ["a/b"]}, {"drones": ["a"], "swarm": str(swarm)}):
         with pytest.raises(UsageError):
             told(**words)

@@ -205,6 +205,7 @@ def test_riding_on_an_open_crazyflie(fake_peer):
         ("ftp://x", "no link for ftp"),
         ("udp://127.0.0.1", "needs a host and a port"),
         ("udp://127.0.0.1:99999", "needs a host and a port"),
+        ("mavlink:nonsense", "mavlink"),
     ],
 )
 def test_uris_that_name_no_link(uri, message):

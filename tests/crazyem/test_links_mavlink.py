@@ -15,7 +15,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from relayed import wait_for
 
 from crazyem.errors import LinkError, UsageError
-from crazyem.links import open_link
 from crazyem.links.base import LinkLost
 from crazyem.links.mavlink.frames import FrameParser, number_of
 from crazyem.links.mavlink.link import MavlinkLink
@@ -367,9 +366,3 @@ def test_it_cannot_be_flown_and_closes_twice():
         link.close()
         with pytest.raises(LinkError, match="not open"):
             link.read_parameter("X")
-
-
-def test_open_link_knows_the_scheme():
-    assert isinstance(open_link("mavlink:udpin:127.0.0.1:14550"), MavlinkLink)
-    with pytest.raises(UsageError):
-        open_link("mavlink:nonsense")

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import queue
 import re
 import time
 
@@ -31,16 +30,14 @@ class LosingLink(fake.FakeLink):
     def __init__(self, *, gone_at=7000, comes_back=True, **options):
         super().__init__(**options)
         self.gone_at, self.comes_back = gone_at, comes_back
-        self.gone = False
-        self.can_reconnect = True
-        self._all = self.packets
-        self.packets = queue.SimpleQueue()
-        self.refused = 0
+        self.gone, self.can_reconnect, self.refused = False, True, 0
 
-    def _run(self):
-        passed, self.packets = self.packets, _Filter(self)
-        self._passed = passed
-        super()._run()
+    def send(self, packet):
+        if self.gone_at is not None and self.fm > self.gone_at:
+            self.gone_at, self.gone = None, True
+            self.packets.put(LinkLost("it was away.", self.host_clock()))
+        if not self.gone:
+            self.packets.put(packet)
 
     def write_parameter(self, name, value, timeout=1.0):
         if self.gone:
@@ -60,27 +57,6 @@ class LosingLink(fake.FakeLink):
             raise LinkError("The drone did not come back.")
         self.gone = False
         return Outage("it was away.", 0.1, float(before), float(self.fm), 0)
-
-
-class _Filter:
-    """What the fake puts into its queue, less what an outage swallows."""
-
-    def __init__(self, link):
-        self.link = link
-
-    def put(self, item):
-        link = self.link
-        if link.gone_at is not None and link.fm > link.gone_at:
-            link.gone_at, link.gone = None, True
-            link._passed.put(LinkLost("it was away.", link.host_clock()))
-        if not link.gone:
-            link._passed.put(item)
-
-    def get(self, timeout=None):
-        return self.link._passed.get(timeout=timeout)
-
-    def get_nowait(self):
-        return self.link._passed.get_nowait()
 
 
 @pytest.fixture(params=["a session's own threads", "a scheduler's"])

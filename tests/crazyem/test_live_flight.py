@@ -4,8 +4,8 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from fake_drone import FakeLink
-from fake_flight import Estimator, FakeFlight
+from fake_drone import FakeEstimator, FakeLink
+from fake_flight import FakeFlight
 
 from crazyem.errors import CrazyemError, DataError, LinkError, UsageError
 from crazyem.live.controllers import LQG
@@ -115,7 +115,7 @@ def test_what_cannot_be_flown_is_refused_on_the_ground(link, options, says):
     ids=["first interrupt", "second interrupt", "link lost", "NaN in a log", "estimator fails"],
 )
 def test_what_ends_a_flight_is_named_and_the_drone_lands_or_is_cut(link, interrupt, fail_at, error, says):
-    flown = FakeFlight(FakeLink(**link), Estimator(fail_at=fail_at), duration=60.0, interrupt=interrupt).fly()
+    flown = FakeFlight(FakeLink(**link), FakeEstimator(fail_at=fail_at), duration=60.0, interrupt=interrupt).fly()
     assert type(flown.error) is error
     assert says in str(flown.error)
     assert flown.link.calls[-1] == "stop"

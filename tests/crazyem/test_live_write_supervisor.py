@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import fake_drone as fake
 import pytest
-from fake_flight import Estimator, FakeFlight
+from fake_flight import FakeFlight
 
 from crazyem.errors import CrazyemError
 from crazyem.estimation.steps import LATEST_DECISION
@@ -46,7 +46,7 @@ def test_good_writes_are_judged_good_and_kept():
 
 
 def test_a_wrong_mass_is_taken_back_and_pushing_ends():
-    flown = FakeFlight(trimmed(), Estimator(WRONG), duration=14.0).fly()
+    flown = FakeFlight(trimmed(), fake.FakeEstimator(WRONG), duration=14.0).fly()
     assert flown.error is None
     assert max(p.value for p in flown.history.pushes if p.parameter == "ctrlLee.mass") > 0.0413
     assert flown.link.values["ctrlLee.mass"] == pytest.approx(0.036)
@@ -63,14 +63,14 @@ def test_a_wrong_mass_is_taken_back_and_pushing_ends():
 def test_without_the_watch_it_stays():
     """The scenario above tests something: nothing else in the guard would have noticed."""
     rules = WriteRules(Policy(watch=MonitorLimits(enabled=False)))
-    flown = FakeFlight(trimmed(), Estimator(WRONG), rules=rules, duration=14.0).fly()
+    flown = FakeFlight(trimmed(), fake.FakeEstimator(WRONG), rules=rules, duration=14.0).fly()
     assert flown.link.values["ctrlLee.mass"] == pytest.approx(WRONG["mass"], rel=0.01)
 
 
 def test_a_stalled_estimator_does_not_blind_the_watch():
     """It hangs right after its first wrong values were written."""
     link = trimmed()
-    estimator = Estimator(WRONG)
+    estimator = fake.FakeEstimator(WRONG)
     write = link.write_parameter
 
     def stall_after_mass(name, value, timeout=1.0):
@@ -135,7 +135,7 @@ def test_an_empty_battery_is_left_alone():
 @pytest.mark.parametrize(("rule", "mass"), [("restore", 0.029), ("good", 0.036), ("keep", 0.036)])
 def test_after_a_failure_the_policy_decides_what_stays(rule, mass):
     rules = WriteRules(Policy(end=EndRules(failed=rule)))
-    flown = FakeFlight(fake.FakeLink(), Estimator(fail_at=1300), rules=rules, duration=60.0).fly()
+    flown = FakeFlight(fake.FakeLink(), fake.FakeEstimator(fail_at=1300), rules=rules, duration=60.0).fly()
     assert isinstance(flown.error, CrazyemError)
     assert not [p for p in flown.history.pushes if not p.verified]
     assert "judged good" in flown.actions()
