@@ -30,6 +30,14 @@ TRUTH = {"mass": 0.036, "Ixx": 2.0e-5, "Iyy": 2.1e-5, "Izz": 3.6e-5, "motor_time
 OPEN = SimpleNamespace(stale=lambda: "", misplaced=lambda purpose: "")  # a write gate that lets everything pass
 
 
+def until(condition, seconds=60.0):
+    """Wait for it, on a busy machine as well."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.005)
+
+
 def float32(value):
     return struct.unpack("<f", struct.pack("<f", value))[0]
 

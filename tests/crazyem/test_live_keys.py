@@ -80,12 +80,15 @@ def test_ending_twice_or_without_beginning_does_nothing(terminal):
     assert termios.tcgetattr(slave) == before
 
 
-@pytest.mark.parametrize("source", ["a pipe", "a closed file", "no standard input"])
+NO_TERMINALS = {"a pipe": Keys, "a closed file": lambda pipe: Keys(-1), "nothing": lambda pipe: Keys()}
+
+
+@pytest.mark.parametrize("source", NO_TERMINALS)
 def test_what_is_no_terminal_gives_no_keys_and_does_not_wait(monkeypatch, source):
     monkeypatch.setattr(sys, "stdin", None)
     read, write = os.pipe()
     try:
-        with Keys({"a pipe": read, "a closed file": -1}[source]) if "input" not in source else Keys() as keys:
+        with NO_TERMINALS[source](read) as keys:
             assert not keys.reading
             assert keys.read(60.0) == ""
     finally:
