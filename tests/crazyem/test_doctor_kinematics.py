@@ -11,7 +11,7 @@ import pytest
 from doctor_checks import IMU, run, with_fields
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_flight import Motion, changed, made_flight
+from made_flight import ROTOR_CONSTANT, Motion, changed, made_flight
 
 from crazyem.doctor.fix import repair
 from crazyem.doctor.weight import apparent_mass
@@ -30,8 +30,10 @@ def found_in(recording: Recording, *checks: str) -> list[Finding]:
     return [finding for name in checks for finding in run(name, recording)]
 
 
-@pytest.mark.parametrize("recording", [made_flight(seconds=1.0), Recording("x", "made", {})], ids=["short", "empty"])
-def test_what_is_too_short_is_not_judged(recording: Recording) -> None:
+@pytest.mark.parametrize("seconds", [0.0, 1.0, 4.0, 8.0])
+def test_what_is_too_short_is_not_judged(seconds: float) -> None:
+    flight = made_flight(seconds=seconds, more=("mocap", "angles", "accelerations")) if seconds else None
+    recording = replace(flight or Recording("x", "made", {}), metadata={"claims": {"mass_kg": "0.03"}})
     assert found_in(recording, "angles", "rates", "velocities", "forces", "tilt", "lag", "weight") == []
 
 
@@ -127,6 +129,12 @@ def test_without_any_pose_the_norm_still_tells_g() -> None:
     flight = made_flight(seconds=20.0, without=["state"])
     in_g = changed(flight, "specific_force", value=flight.signals["specific_force"].value / G)
     assert "in g, not m/s^2" in found_in(in_g, "forces")[0].text
+
+
+def test_a_scale_that_noise_hides_is_not_named() -> None:
+    noise = np.random.default_rng(0).normal(0.0, 0.5, _value("velocity").shape)
+    noisy = changed(FLIGHT, "velocity", value=_value("velocity") * [1.3, 1.0, 1.0] + noise)
+    assert found_in(noisy, "velocities") == []
 
 
 def test_one_attitude_is_no_proof_against_a_gyro() -> None:
@@ -235,6 +243,10 @@ def test_the_apparent_mass_is_thrust_over_specific_force(mass: float, seed: int)
     assert found_in(flight, "weight") == []
     for claim in (str(mass), "heavy", "", "nan", "-1", "inf"):
         assert found_in(replace(flight, metadata={"claims": {"mass_kg": claim}}), "weight") == []
+    turning = made_flight(Motion(seconds=20.0, seed=seed, mass=mass), seed=seed, more=("rpm",), without=("motor",))
+    by_speed = apparent_mass(turning, replace(load_vehicle("cf21bl"), rotor_constant=ROTOR_CONSTANT))
+    assert by_speed is not None
+    assert abs(by_speed.mass / mass - 1.0) < 0.02
     (finding,) = found_in(replace(flight, metadata={"claims": {"mass_kg": str(0.6 * mass)}}), "weight")
     assert abs(finding.evidence["ratio"] - 1.0 / 0.6) < 0.05
     assert finding.fix is None

@@ -48,10 +48,10 @@ def a_set(changed=None):
     return Decision(1.0, writes=writes_for(LEE, changed or NEW, beliefs=NOMINAL, originals=ORIGINALS))
 
 
-def run(drone, *decisions, guard=None, **kw):
+def run(drone, *decisions, guard=None, known=ORIGINALS, **kw):
     guard, history = guard or Guard(LEE, nominal=NOMINAL, originals=ORIGINALS), History()
     done = []
-    pusher = Pusher(drone, guard, gate=fake.OPEN, history=history, timeout=0.01, known=ORIGINALS,
+    pusher = Pusher(drone, guard, gate=fake.OPEN, history=history, timeout=0.01, known=known,
                     on_done=lambda d, why: done.append((d.kind, not why)), **kw)  # fmt: skip
     for decision in decisions:
         pusher.submit(decision)
@@ -116,6 +116,12 @@ def test_what_cannot_be_undone_is_said():
     assert any("could not be written back" in n for n in history.notices)
     assert math.isnan(pusher.known["ctrlLee.mass"])
     assert drone.attempts == 4 + 2 * WRITE_ATTEMPTS
+
+
+def test_what_was_not_known_before_is_not_undone():
+    guard, history, _, _ = run(Drone(lambda n: True), a_set(), known={})
+    assert guard.stopped
+    assert [(p.purpose, p.verified) for p in history.pushes] == [("push", False)]
 
 
 @pytest.mark.parametrize("error", [LinkError("gone."), RuntimeError("a fault nobody foresaw")])

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from crazyem.errors import UsageError
-from crazyem.recordings import Event, ReadOptions, Recording, SignalArray, open_recording
+from crazyem.recordings import Event, Finding, Fix, Grade, ReadOptions, Recording, SignalArray, open_recording
 from crazyem.recordings.mcap import file as mcap_file
+from crazyem.recordings.mcap.findings import findings_from_json, findings_to_json
 from crazyem.recordings.mcap.signals import write_recording
 from crazyem.recordings.mcap.stream_codec import unique_name
 from crazyem.signals.sample import SIGNALS
@@ -157,3 +158,11 @@ def test_many_signals_in_one_stream(tmp_path):
         for i in range(150)
     }
     assert_round_trip(Recording("w", "test", signals), tmp_path / "w.mcap")
+
+
+@pytest.mark.parametrize("runs", [[[5, 1]], [[-1, 3]], [[0, 10**9]]], ids=["back", "before the first", "far too many"])
+def test_rows_of_a_repair_that_cannot_be_are_refused(runs):
+    good = json.loads(findings_to_json([Finding("gaps", Grade.HARMLESS, "A.", fix=Fix("mark", (), rows=np.arange(3)))]))
+    good[0]["fix"]["rows"] = runs
+    with pytest.raises(ValueError, match="rows"):
+        findings_from_json(json.dumps(good))
