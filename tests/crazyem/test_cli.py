@@ -1,5 +1,6 @@
 """The command line: options, exit codes, and one clear sentence for everything a user can get wrong."""
 
+import json
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -8,7 +9,7 @@ import pytest
 from mavlink_pilot import free_port
 from recording_files import fails
 
-from crazyem.cli import parser
+from crazyem.cli import main, parser
 from crazyem.commands.common import compile_kernels
 from crazyem.control.named_trajectories import trajectory_maker
 from crazyem.errors import UsageError
@@ -125,6 +126,17 @@ def test_a_file_that_is_no_recording(capsys, tmp_path, content):
     path = tmp_path / "notes.txt"
     path.write_bytes(content)
     assert "notes.txt" in fails(capsys, "replay", path, code=3)
+
+
+def test_replay_of_a_real_recording(capsys, tmp_path, shared_recordings):
+    out, flight = tmp_path / "r.json", shared_recordings / "nanobench" / "B3_figure8_medium_rep1.csv.gz"
+    assert main(["replay", str(flight), "--vehicle", "cf2", "--to", "8", "--every", "40", "--json", str(out)]) == 0
+    summary = json.loads(out.read_text())
+    assert set(summary["estimates"]) >= {"mass", "Ixx", "Iyy", "Izz", "motor_time_constant"}
+    assert {"value", "sd", "ci95", "unit", "identifiable", "reason"} <= set(summary["estimates"]["mass"])
+    assert any("thrust scale" in n for n in summary["notices"])
+    assert (tmp_path / "r.png").stat().st_size > 10_000
+    assert "mass" in capsys.readouterr().out
 
 
 def test_trajectory_maker_reads_the_waypoints_at_once(tmp_path):
