@@ -5,20 +5,19 @@ from dataclasses import replace
 import numpy as np
 from made_flight import changed
 
-from crazyem.doctor import CHECKS as CHECKS_OF_DOCTOR
+from crazyem.doctor import CHECKS
 from crazyem.recordings.finding import Finding
 from crazyem.recordings.recording import Recording
 
 IMU = ("body_rate", "specific_force")  # the signals of the stream "imu" of a made flight
-CHECKS = ("numbers", "gaps", "interpolated", "repeated", "clocks", "frozen", "saturation", "rotor_sensor", "flight")
 
 
 def run(check: str, recording: Recording) -> list[Finding]:
-    return next(c for c in CHECKS_OF_DOCTOR if c.module == check).run(recording)
+    return next(c for c in CHECKS if c.module == check).run(recording)
 
 
 def everything(recording: Recording) -> list[Finding]:
-    return [finding for check in CHECKS for finding in run(check, recording)]
+    return [finding for check in CHECKS for finding in check.run(recording)]
 
 
 def only(check: str, recording: Recording) -> Finding:

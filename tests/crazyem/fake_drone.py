@@ -30,6 +30,14 @@ TRUTH = {"mass": 0.036, "Ixx": 2.0e-5, "Iyy": 2.1e-5, "Izz": 3.6e-5, "motor_time
 OPEN = SimpleNamespace(stale=lambda: "", misplaced=lambda purpose: "")  # a write gate that lets everything pass
 
 
+def until(condition, seconds=60.0):
+    """Wait for it, on a busy machine as well."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.005)
+
+
 def float32(value):
     return struct.unpack("<f", struct.pack("<f", value))[0]
 
@@ -180,6 +188,9 @@ class FakeLink:
             time.sleep(0.001)
         self._free_until[what] = self.fm + 1000  # ms; it does not catch up, perhaps because it waits for the drone
 
+    def send(self, packet):
+        self.packets.put(packet)
+
     def _run(self):
         while not self._stop.is_set():
             self._wait()
@@ -198,7 +209,7 @@ class FakeLink:
                 self.motors = False
             for block in tuple(self.blocks):
                 values = tuple(self.value(v.name) for v in block.variables)
-                self.packets.put(Packet(block.identifier, self.fm, self.host_clock(), values))
+                self.send(Packet(block.identifier, self.fm, self.host_clock(), values))
             time.sleep(STEP / 1000.0 / self.speed)
 
     def value(self, name):
@@ -217,34 +228,42 @@ class FakeLink:
 
 
 class FakeEstimator:
-    """Says the truth after `after` samples in the air, wider before."""
+    """Says `values` after some samples in the air, wider before.
 
-    def __init__(self, *, every=4, error=None):
+    At sample `stall_at` in the air it hangs until `released`, at `fail_at` it fails.
+    """
+
+    def __init__(self, values=None, *, every=4, stall_at=None, fail_at=None):
+        self.values = {**TRUTH, **(values or {})}
         self.airborne = False
         self.update_seconds = []
         self.every = every
-        self.error = error
+        self.stall_at, self.released, self.stalled = stall_at, threading.Event(), False
+        self.fail_at = fail_at
         self.n = 0
         self.updates = 0
         self.time = 0.0
 
     def feed(self, sample):
+        if self.stall_at is not None and self.n >= self.stall_at:
+            self.stalled = not self.released.is_set()  # the drone does not wait for it
+            self.released.wait(600.0)
+        if self.fail_at is not None and self.n >= self.fail_at:
+            raise ValueError("boom")
         if sample.signal == "flying":
             self.airborne = sample.value[0] > 0
         if sample.signal != "position" or not self.airborne:
             return None
         self.n += 1
         self.time = sample.time
-        if self.error and self.n > 300:
-            raise self.error
         return None if self.n % self.every else self.finish()
 
     def finish(self):
         self.updates += 1
         self.update_seconds.append(1e-4)
-        sd = 0.3 / max(self.n, 1)
         parameters = {}
-        for name, value in TRUTH.items():
-            ci = (value * (1 - 1.96 * sd), value * (1 + 1.96 * sd))
-            parameters[name] = ParameterEstimate(value, sd * value, ci, PARAMETER_UNITS[name], self.n > 50)
+        for name, value in self.values.items():
+            sd = 0.3 / max(self.n, 1) * value
+            ci = (value - 2 * sd, value + 2 * sd)
+            parameters[name] = ParameterEstimate(value, sd, ci, PARAMETER_UNITS[name], self.n > 50)
         return Estimate(self.time, parameters, samples=self.n, updates=self.updates, converged=True)

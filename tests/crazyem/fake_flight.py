@@ -8,7 +8,6 @@ import fake_drone as fake
 
 from crazyem.control.trajectories import hover
 from crazyem.errors import CrazyemError
-from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
 from crazyem.live.controllers import LEE
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
 from crazyem.live.session import Session
@@ -30,38 +29,12 @@ class Recorder:
         return [arguments[0] for called, arguments in self.calls if called == name]
 
 
-class Estimator(fake.FakeEstimator):
-    """Says `values`, precisely; at sample `stall_at` in the air it hangs until `released`, at `fail_at` it fails."""
-
-    def __init__(self, values=None, *, stall_at=None, fail_at=None):
-        super().__init__()
-        self.fail_at = fail_at
-        self.values = {**fake.TRUTH, **(values or {})}
-        self.stall_at, self.released, self.stalled = stall_at, threading.Event(), False
-
-    def finish(self):
-        base = super().finish()
-        p = {}
-        for name, value in self.values.items():
-            sd = 0.3 / max(self.n, 1) * value
-            p[name] = ParameterEstimate(value, sd, (value - 2 * sd, value + 2 * sd), PARAMETER_UNITS[name], self.n > 50)
-        return Estimate(base.time, p, samples=self.n, updates=self.updates, converged=True)
-
-    def feed(self, sample):
-        if self.stall_at is not None and self.n >= self.stall_at:
-            self.stalled = not self.released.is_set()  # the drone does not wait for it
-            self.released.wait(600.0)
-        if self.fail_at is not None and self.n >= self.fail_at:
-            raise ValueError("boom")
-        return super().feed(sample)
-
-
 class FakeFlight:
     """A flight of `duration` s; Ctrl-C comes at the ms `interrupt` of firmware time. `plan`: see `FlightPlan`."""
 
     def __init__(self, link, estimator=None, *, trajectory=hover, duration=10.0, controller=LEE, interrupt=(), **plan):
         self.link, self.recorder, self.error = link, Recorder(), None
-        self.estimator = estimator or Estimator()
+        self.estimator = estimator or fake.FakeEstimator()
         self.session = Session(link, vehicle=load_vehicle("cf2"), estimator=self.estimator, recorder=self.recorder)
         self.history = self.session.history
 

@@ -1,7 +1,7 @@
 """Recordings on disk for tests, how tests of commands run one, and recordings in parts against the whole."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import pytest
 from made_flight import made_flight
 
 from crazyem.cli import main
+from crazyem.errors import FileFormatError
 from crazyem.recordings import Recording, SignalArray
 from crazyem.recordings.export import export
 
@@ -87,3 +88,26 @@ def assert_same_signals(one: Mapping[str, SignalArray], other: Mapping[str, Sign
                 assert a.dtype == b.dtype
                 a, b = a.tobytes(), b.tobytes()
             assert a == b, (name, field.name)
+
+
+def assert_cut_anywhere(read: Callable[[bytes], Recording], content: bytes, edges: list[int], *, first: int) -> None:
+    """Cut at any byte, a log has its whole records before the cut, from `first` on; and it says where the rest begins.
+
+    edges: where its records begin and end.
+    """
+    whole = list(read(content).signals.values())
+    near = {edge + d for edge in edges for d in (-1, 0, 1)} & set(range(len(content)))
+    for size in sorted({*range(0, len(content), 5), *near}):
+        try:
+            part = read(content[:size])
+        except FileFormatError:
+            assert size < first
+            continue
+        for signal in part.signals.values():
+            n, same = signal.time.size, next(s for s in whole if s.source == signal.source)
+            if same.quantity == signal.quantity:
+                np.testing.assert_array_equal(signal.value, same.value[:n])
+            if signal.clock == "autopilot":
+                np.testing.assert_array_equal(signal.time, same.time[:n])
+        cut = [f.evidence["offset"] for f in part.findings if f.check == "integrity"]
+        assert cut == ([] if size in edges else [max(edge for edge in edges if edge <= size)])

@@ -1,8 +1,13 @@
-"""A connected link, and the fault relay in a thread, between a test's link and its drone."""
+"""A connected link, what comes from it, and the fault relay in a thread between a test's link and its drone.
+
+Limits are for a link that is stuck.
+"""
 
 import contextlib
 import threading
+import time
 
+from crazyem.links.base import Packet
 from crazyem.links.crazyflie import CrazyflieLink
 from firmware_sim.relay.faults import Engine, Fault
 from firmware_sim.relay.relay import Relay, parse_target
@@ -47,3 +52,32 @@ def now_on(relay, *faults):
     """These faults from now on: their times count from here."""
     relay.engine.began = None
     relay.engine.replace(faults)
+
+
+PATIENCE = 60.0  # s
+
+
+def wait_for(link, kind):
+    """The next item of that kind; what comes before it is dropped."""
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        item = link.packets.get(timeout=PATIENCE)
+        if isinstance(item, kind):
+            return item
+    raise AssertionError(f"no {kind.__name__} came")
+
+
+def packets(link, count):
+    """So many log packets, however long they take."""
+    return [wait_for(link, Packet) for _ in range(count)]
+
+
+def take(link, seconds):
+    """Everything that comes in a while: to let time pass, or to see that nothing comes."""
+    items, deadline = [], time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if link.packets.empty():
+            time.sleep(0.005)
+        else:
+            items.append(link.packets.get_nowait())
+    return items

@@ -140,8 +140,8 @@ def columns(table: pd.DataFrame, names: str) -> np.ndarray:
     return table[names.split()].to_numpy(float)
 
 
-def usd(path: Path) -> Facts:
-    """A uSD log: header, records, checksum, one by one with struct."""
+def usd_table(path: Path) -> pd.DataFrame:
+    """The fixed-frequency records of a uSD log, "t" in us: header, records, checksum, one by one with struct."""
     data = path.read_bytes()
     count = struct.unpack_from("<H", data, 3)[0]
     at, events = 5, {}
@@ -162,15 +162,17 @@ def usd(path: Path) -> Facts:
     assert at == len(data) - 4
     assert zlib.crc32(data[:-4]) == struct.unpack("<I", data[-4:])[0]
     names, rows = events[0xFFFF]
-    table = pd.DataFrame(rows, columns=["t", *(name[:-3] for name in names)], dtype=float)
+    return pd.DataFrame(rows, columns=["t", *(name[:-3] for name in names)], dtype=float)
+
+
+def usd(path: Path) -> Facts:
+    table = usd_table(path)
     time = table["t"].to_numpy() / 1e6
     facts = stream(time)
     nominal = 10.0 ** round(np.log10(facts["real_hz"]))
     facts["fast_percent"] = 100.0 * (facts["real_hz"] / nominal - 1.0)
-    facts |= (
-        lighthouse(table, time) if "stateEstimate.z" in table or "controller.cmd_thrust" in table else imu(table, time)
-    )
-    return facts
+    look = lighthouse if "stateEstimate.z" in table or "controller.cmd_thrust" in table else imu
+    return facts | look(table, time)
 
 
 def lighthouse(table: pd.DataFrame, time: np.ndarray) -> Facts:
@@ -236,7 +238,6 @@ def imu(table: pd.DataFrame, time: np.ndarray) -> Facts:
         "held_share": float(same(duty)[flying].mean()),
         "mixer_share": on_grid(duty),
         "airborne_s": float(flying.sum()) * float(np.median(np.diff(time))),
-        "duty_max": float(duty.max() / 65535.0),
     }
 
 
@@ -307,12 +308,11 @@ def nanobench(path: Path) -> Facts:
 
 
 def polygon(time: np.ndarray, value: np.ndarray) -> Facts:
-    """Corners of a slow stream that was drawn onto the rows, and how long there was none."""
+    """How long there was no corner of a slow stream that was drawn onto the rows."""
     share = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
     bent = np.abs(value[1:-1] - value[:-2] - share * (value[2:] - value[:-2])) > 5e-9
     at = np.array([0.5 * (time[a + 1] + time[b + 1]) for a, b in stretches(bent)])
-    step = np.diff(at)
-    return {"corners": float(at.size), "corner_gap_s": float(step.max())}
+    return {"corner_gap_s": float(np.diff(at).max())}
 
 
 def published(d: pd.DataFrame, quaternion: Rotation, onboard: Rotation, spin: np.ndarray, up: np.ndarray) -> Facts:
@@ -372,7 +372,6 @@ def nanodrone(path: Path) -> Facts:
     whole = same(columns(d, "x y z vx vy vz qx qy qz qw wx wy wz ax ay az"))
     facts |= {"same_rows": float(whole[air].mean()), "same_rows_most": float(longest(whole, np.arange(time.size)) + 1)}
     facts["same_lens"] = float((same(lens) & ~whole)[air].mean())
-    facts["same_lens_all"] = float(same(lens)[air].mean())
     facts["same_motors"] = float((same(np.c_[duty, np.nan_to_num(erpm)]) & ~whole)[air].mean())
     facts["same_force"] = float((same(columns(d, "qx qy qz qw ax ay az")) & ~whole)[air].mean())
     facts["voltage_min_V"] = float(np.nanmin(columns(d, "Vbat")[air]))
@@ -424,7 +423,7 @@ def real_firmware(path: Path) -> Facts:
     code = d[d["name"] == "stateEstimateZ.quat"]["value"].to_numpy().astype(np.int64)
     facts["tilt_max_deg"] = max(tilt_of_code(int(c)) for c in code)
     volts = (d[d["name"] == "pm.vbatMV"]["value"].to_numpy() + 0.5) / 1e3  # whole mV, cut off
-    facts |= {"voltage_min_V": float(volts.min()), "voltage_max_V": float(volts.max())}
+    facts["voltage_min_V"] = float(volts.min())
     state = {k: d[d["name"] == f"stateEstimateZ.{k}"]["value"].to_numpy() / 1e3 for k in ("z", "vx", "vy", "vz")}
     facts["altitude_max_m"] = float(state["z"].max())
     facts["airborne_s"] = float((state["z"] > 0.05).sum()) * 0.01

@@ -1,38 +1,20 @@
 """The command line: options, exit codes, and one clear sentence for everything a user can get wrong."""
 
 import json
-import socket
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
+from mavlink_pilot import free_port
+from recording_files import fails
 
 from crazyem.cli import main, parser
+from crazyem.commands.common import compile_kernels
 from crazyem.control.named_trajectories import trajectory_maker
 from crazyem.errors import UsageError
-
-NANOBENCH = "nanobench/B3_figure8_medium_rep1.csv.gz"
-
-
-@pytest.fixture
-def free_port():
-    """A UDP port nobody listens on."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
-
-
-def fails(capsys, *argv, code=None):
-    """Run, expect an error exit, return its one sentence."""
-    got = main([str(a) for a in argv])
-    assert got != 0
-    if code is not None:
-        assert got == code
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("crazyem: ")]
-    assert len(lines) == 1
-    assert "Traceback" not in lines[0]
-    assert lines[0].endswith(".")
-    return lines[0]
+from crazyem.live import warm_up
+from crazyem.vehicle import load_vehicle
 
 
 def test_help_is_quick_and_imports_nothing_heavy():
@@ -61,8 +43,8 @@ def test_options_named_in_the_interface_exist():
 
 
 @pytest.mark.parametrize("words", ["{uri} --trajectory hover", "--trajectory hover {uri}"])
-def test_nothing_at_the_uri_which_may_follow_the_trajectory(capsys, free_port, words):
-    uri = f"udp://127.0.0.1:{free_port}"
+def test_nothing_at_the_uri_which_may_follow_the_trajectory(capsys, words):
+    uri = f"udp://127.0.0.1:{free_port()}"
     said = fails(capsys, "fly", *words.format(uri=uri).split(), code=4)
     assert "Nothing answers" in said
     assert uri in said
@@ -102,6 +84,29 @@ def test_unknown_log_variable_is_named(capsys, fake_peer):
         (["fly", "carrier-pigeon://1"], "carrier-pigeon"),
         (["watch", "nonsense"], "nonsense"),
         (["replay", "none.mcap"], "none.mcap"),
+        (["fly", "--rate", "1001"], "--rate"),
+        (["fly", "--rate", "0"], "--rate"),
+        (["fly", "--rate", "nan"], "--rate"),
+        (["fly", "--reconnect", "-1"], "--reconnect"),
+        (["links", "--ports", "0"], "--ports"),
+        (["links", "--ports", "9", "--no-air", "--json", "no/such/folder/x.json"], "cannot write"),
+        # what may write
+        (["fly", "--push", "--no-push"], "--no-push"),
+        (["fly", "--confirm", "--dry-run"], "--dry-run"),
+        (["fly", "--policy", "nowhere.toml"], "nowhere.toml"),
+        (["watch", "udp://127.0.0.1:1", "--push"], "MAVLink drones only"),
+        (["watch", "mavlink:udpin:nowhere"], "needs a host and a port"),
+        (["fly", "mavlink:udpin:127.0.0.1:14550"], "use crazyem watch"),
+        # several drones
+        (["fly", "--uri", "udp://h:1", "--uri", "udp://h:1"], "given twice"),
+        (["fly", "--uri", "udp://h:1", "--swarm", "s.toml"], "not both"),
+        (["fly", "--swarm", "no.toml"], "cannot read the swarm file no.toml"),
+        (["fly", "--uri", "udp://h:1", "--seed", "3"], "built-in simulator"),
+        (["fly", "--uri", "mavlink:udpin:h:1"], "ground station"),
+        (["watch", "--uri", "udp://h:1", "--push"], "watched only"),
+        (["watch"], "needs a URI"),
+        (["fly", "--live"], "--live needs a terminal"),
+        (["fly", "--uri", "udp://h:1", "--trajectory", "loop"], "unknown trajectory"),
     ],
 )
 def test_wrong_usage_is_one_sentence(capsys, argv, says):
@@ -124,29 +129,14 @@ def test_a_file_that_is_no_recording(capsys, tmp_path, content):
 
 
 def test_replay_of_a_real_recording(capsys, tmp_path, shared_recordings):
-    out = tmp_path / "r.json"
-    words = ["replay", str(shared_recordings / NANOBENCH), "--vehicle", "cf2", "--to", "8", "--every", "40"]
-    assert main([*words, "--json", str(out)]) == 0
+    out, flight = tmp_path / "r.json", shared_recordings / "nanobench" / "B3_figure8_medium_rep1.csv.gz"
+    assert main(["replay", str(flight), "--vehicle", "cf2", "--to", "8", "--every", "40", "--json", str(out)]) == 0
     summary = json.loads(out.read_text())
     assert set(summary["estimates"]) >= {"mass", "Ixx", "Iyy", "Izz", "motor_time_constant"}
     assert {"value", "sd", "ci95", "unit", "identifiable", "reason"} <= set(summary["estimates"]["mass"])
     assert any("thrust scale" in n for n in summary["notices"])
     assert (tmp_path / "r.png").stat().st_size > 10_000
     assert "mass" in capsys.readouterr().out
-
-
-def test_nan_in_a_recording_is_named(capsys, tmp_path, shared_recordings):
-    import gzip
-
-    lines = gzip.decompress((shared_recordings / NANOBENCH).read_bytes()).decode().splitlines()
-    header = lines[0].split(",")
-    fields = lines[400].split(",")
-    fields[next(i for i, n in enumerate(header) if "vbat" in n.lower())] = "nan"
-    lines[400] = ",".join(fields)
-    path = tmp_path / "damaged.csv"
-    path.write_text("\n".join(lines) + "\n")
-    said = fails(capsys, "replay", path, "--vehicle", "cf2", code=5)
-    assert "voltage is not a number" in said
 
 
 def test_trajectory_maker_reads_the_waypoints_at_once(tmp_path):
@@ -176,3 +166,29 @@ def test_a_plot_is_written_only_beside_a_file_that_was_asked_for():
     assert plot_path(Namespace(plot=None), None, "-") is None
     assert plot_path(Namespace(plot=None), "a/f.csv.gz", "b.json") == "a/f.png"
     assert plot_path(Namespace(plot="p.png"), None, "b.json") == "p.png"
+
+
+# --- whether something was compiled is counted, not told by the clock: a slow start is no compilation ---
+
+
+def test_a_start_from_the_disk_says_nothing_however_slow(monkeypatch, capsys) -> None:
+    vehicle = load_vehicle("cf2")
+    warm_up.warm_up(vehicle)
+    clock = iter((0.0, 60.0))
+    monkeypatch.setattr(warm_up, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    compile_kernels(vehicle)
+    assert "compiled" not in "".join(capsys.readouterr())
+
+
+def test_a_compilation_is_told(monkeypatch, capsys) -> None:
+    counts = iter((0, 3))
+    monkeypatch.setattr(warm_up, "compilations", lambda: next(counts))
+    compile_kernels(load_vehicle("cf2"))
+    assert "compiled the estimator in" in "".join(capsys.readouterr())
+
+
+def test_rates_and_patience_by_default():
+    fly = parser().parse_args(["fly"])
+    watch = parser().parse_args(["watch", "udp://127.0.0.1:1"])
+    assert (fly.rate, fly.reconnect) == (1000.0 / 11.0, 8.0)
+    assert (watch.rate, watch.reconnect) == (1000.0 / 11.0, 30.0)

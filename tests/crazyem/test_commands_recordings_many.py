@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from recording_files import fails, flight_fixture, folder_fixture, link_pair, run
 
-from crazyem.commands import batch
+from crazyem.commands import batch, output
 from crazyem.commands.merge import merge_findings
 from crazyem.commands.output import Report, Result, plain
 from crazyem.commands.workers import shared
@@ -142,6 +142,16 @@ def test_processes_and_a_cluster_give_what_one_process_gives(capsys: pytest.Capt
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
         assert told("--cluster", cluster.scheduler_address) == alone
+
+
+def test_progress_is_a_line_now_and_then_where_there_is_no_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(output, "_FIRST_PROGRESS", 0.0)
+    with output.Progress("info", 3) as progress:
+        for _ in range(3):
+            progress.step()
+    assert capsys.readouterr().err == "info: 1 of 3 files\n"
 
 
 def test_the_report_keeps_the_first_error(capsys: pytest.CaptureFixture[str]) -> None:

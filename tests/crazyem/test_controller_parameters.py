@@ -2,16 +2,18 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 import pytest
+import test_guard
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import butter, tf2ss
 
 from crazyem.control.command_units import LOOP, effectiveness_torque, lag_share, rotor_reaction_factor
-from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
+from crazyem.estimation.result import Estimate
 from crazyem.estimation.verdict import NOT_CONVERGED
 from crazyem.live.beliefs import Slot
 from crazyem.live.controllers import (
@@ -32,13 +34,7 @@ TRUTH = {"mass": 0.029, "Ixx": 1.9e-5, "Iyy": 1.8e-5, "Izz": 3.3e-5, "motor_time
 NAMES = ("Ixx", "Iyy", "Izz")
 
 
-def estimate(time, *, relative_sd=0.003, **values):
-    parameters = {}
-    for name in (*PARAMETER_UNITS, "drag_x", "drag_y"):
-        v = values.get(name, TRUTH.get(name, 0.05))
-        sd = relative_sd * abs(v)
-        parameters[name] = ParameterEstimate(v, sd, (v - 1.96 * sd, v + 1.96 * sd), "", True, "")
-    return Estimate(time, parameters)
+estimate = partial(test_guard.estimate, truth=TRUTH, drag_x=0.05, drag_y=0.05)
 
 
 def bound_to(controller, vehicle=CF2):
@@ -57,14 +53,7 @@ def guard_of(controller, vehicle=CF2, **originals):
 
 
 def decided(guard, seconds=8.0, make=estimate, judged=True):
-    out = []
-    for i in range(int(seconds / 0.04)):
-        d = guard.consider(make(0.04 * i), 0.04 * i, airborne=True)
-        if d.writes:
-            out.append(d)
-            if judged:
-                guard.trust()
-    return out
+    return test_guard.run(guard, seconds, make=make, judged=judged)
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.5])

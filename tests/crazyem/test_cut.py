@@ -1,6 +1,5 @@
 """--from and --to: a piece of a recording gives what a file gives that was cut beforehand."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,23 +37,6 @@ def test_a_piece_holds_the_samples_between_its_ends_and_no_others(start: float, 
         assert piece.signals[name].time.tolist() == inside
         assert piece.signals[name].value[:, 0].tolist() == [2.0 * t for t in inside]
     assert cut(piece, start, end).signals["a"].time.size == piece.signals["a"].time.size
-
-
-@given(st.floats(-1.0, 11.0))
-def test_two_pieces_are_the_whole(at: float) -> None:
-    whole = recording()
-    halves = [half for half in _halves(whole, at) if half is not None]
-    for name, signal in whole.signals.items():
-        joined = np.concatenate([half.signals[name].time for half in halves])
-        np.testing.assert_array_equal(joined, signal.time)
-
-
-def _halves(whole: Recording, at: float) -> Iterator[Recording | None]:
-    for start, end in ((None, at), (float(np.nextafter(at, np.inf)), None)):
-        try:
-            yield cut(whole, start, end)
-        except UsageError:
-            yield None
 
 
 def test_findings_and_events_outside_are_left_out_and_rows_are_counted_anew() -> None:

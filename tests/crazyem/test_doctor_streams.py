@@ -1,16 +1,18 @@
 """The checks on streams: each fault, planted into a good flight anywhere and in any size, is found where it is.
 
-Here: good flights, hostile ones, numbers, gaps, interpolated, repeated. The rest is in test_doctor_health.py.
+Here: good and hostile flights before every check; numbers, gaps, interpolated, repeated. The rest:
+test_doctor_health.py and test_doctor_kinematics.py.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from doctor_checks import covers, everything, only, rows_of, run, with_fields, with_values
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_flight import Motion, array_of, changed, made_flight
+from made_flight import MORE, Motion, array_of, changed, made_flight
 
 from crazyem.doctor.gaps import lost_records
 from crazyem.doctor.streams import cadence
@@ -27,26 +29,34 @@ def good() -> Recording:
 # -- good flights -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"seed": 3, "seconds": 30.0},
-        {"motion": Motion(size=0.0)},
-        {"motion": Motion(size=0.8, frequency=0.35, turn=1.0)},
-        {"jitter": 0.1, "more": ("mocap", "onboard", "rpm", "accelerations", "angles")},
-        {"jitter": 0.3},
-        {"rates": {"imu": 1000.0, "state": 250.0}},
-        {"noise": 0.0},
-        {"noise": 5.0},
-    ],
-)
-def test_silent_on_good_flights(options):
-    assert [f.text for f in everything(made_flight(**options))] == []
+GOOD: dict[str, dict[str, Any]] = {
+    "as made": {"seed": 3, "seconds": 30.0},
+    "hover": {"motion": Motion(seconds=20.0, size=0.0, yaw=0.0)},
+    "slow and noisy": {"motion": Motion(seconds=20.0, size=0.15, yaw=0.0), "noise": 3.0},
+    "fast, turning": {"motion": Motion(size=0.8, frequency=0.35, turn=1.0)},
+    "jitter": {"jitter": 0.3},
+    "74 Hz and 1 kHz": {"motion": Motion(seconds=20.0, turn=1.0), "rates": {"state": 74.0, "imu": 1000.0}},
+    "30 Hz": {"seconds": 25.0, "rates": {"state": 30.0, "imu": 100.0}, "noise": 2.0},
+    "angles at 1 kHz": {"seconds": 12.0, "rates": {"angles": 1000.0}, "more": ["angles"]},
+    "no noise": {"noise": 0.0},
+    "no pose": {"seconds": 20.0, "without": ["state"]},
+    "no IMU": {"seconds": 20.0, "without": ["imu"]},
+}
 
 
-@given(seed=st.integers(0, 10_000), size=st.floats(0.0, 0.7), rate=st.sampled_from([50.0, 100.0, 200.0, 500.0]))
-def test_silent_on_any_good_flight(seed, size, rate):
-    recording = made_flight(Motion(seconds=12.0, seed=seed, size=size), seed=seed, rates={"imu": rate}, more=("rpm",))
+@pytest.mark.parametrize("kind", GOOD)
+def test_silent_on_good_flights(kind):
+    assert [f.text for f in everything(made_flight(**GOOD[kind]))] == []
+
+
+@given(
+    seed=st.integers(0, 100_000), size=st.floats(0.0, 0.8), turn=st.floats(-1.0, 1.0), noise=st.floats(0.2, 4.0),
+    rate=st.sampled_from([50.0, 100.0, 200.0, 500.0]),
+)  # fmt: skip
+@settings(max_examples=settings.default.max_examples // 3)
+def test_silent_on_any_good_flight(seed, size, turn, noise, rate):
+    motion = Motion(seconds=15.0, seed=seed, size=size, turn=turn)
+    recording = made_flight(motion, seed=seed, noise=noise, rates={"imu": rate}, jitter=0.1, more=tuple(MORE))
     assert [f.text for f in everything(recording)] == []
 
 
@@ -59,44 +69,33 @@ def test_silent_on_coarse_signals_of_a_hover():
 
 
 HOSTILE = (0.0, 1.0, -1.0, 0.6, 65535.0, 1e300, -1e300, 5e-324, np.nan, np.inf, -np.inf)
+NAMES = [*SIGNALS, "position@x", "attitude@x", "euler@x", "motor.m1", "some.column"]
+WILD = (0.0, 1e-9, 1.0, -5.0, 1e9, np.nan, np.inf)  # s
 
 
 @given(data=st.data())
 def test_nothing_makes_a_check_fail(data):
     """Empty, tiny, unsorted, constant, huge and missing: findings or none, never an error or a warning."""
     signals = {}
-    names = st.sampled_from([*SIGNALS, "position@x", "motor.m1", "some.column"])
-    for name in data.draw(st.lists(names, min_size=1, max_size=5, unique=True)):
-        quantity = name.split("@")[0]
-        components = SIGNALS[quantity][0] if quantity in SIGNALS else 1
-        n = data.draw(st.sampled_from([0, 1, 2, 3, 9, 60, 120]))
+    few = st.lists(st.sampled_from(NAMES), min_size=1, max_size=5, unique=True)
+    for name in data.draw(few | st.just(NAMES) | st.just(NAMES[::-1])):
+        quantity = name.split("@")[0] if name.split("@")[0] in SIGNALS else ""
+        components = SIGNALS[quantity][0] if quantity else 1
+        n = data.draw(st.sampled_from([0, 1, 3, 9, 60, 120, 900]))
         rng = np.random.default_rng(data.draw(st.integers(0, 99)))
-        kind = data.draw(st.sampled_from(["noise", "constant", "hostile", "steps", "nan"]))
-        value = {
-            "noise": rng.normal(size=(n, components)),
-            "constant": np.full((n, components), 0.5),
-            "hostile": rng.choice(HOSTILE, (n, components)),
-            "steps": np.repeat(rng.normal(size=(n, components)), 5, axis=0)[:n],
-            "nan": np.full((n, components), np.nan),
-        }[kind]
-        steps = data.draw(st.sampled_from(["even", "same", "random", "wild"]))
-        time = {
-            "even": np.arange(n) * 0.01,
-            "same": np.zeros(n),
-            "random": rng.random(n) * 3.0,
-            "wild": rng.choice([0.0, 1e-9, 1.0, -5.0, 1e9, np.nan, np.inf], n),
-        }[steps]
+        noise = rng.normal(size=(n, components))
+        values = [noise, 10.0 ** rng.integers(-300, 300) * noise, np.full_like(noise, 0.5), np.full_like(noise, np.nan)]
+        values += [rng.choice(HOSTILE, noise.shape), np.repeat(noise, 5, axis=0)[:n]]
+        values.append(np.where(rng.random(noise.shape) < 0.05, rng.choice(HOSTILE, noise.shape), noise))
+        times = [np.arange(n) * 0.01, np.zeros(n), rng.random(n) * 3.0]
+        times += [rng.choice(WILD, n), np.cumsum(rng.choice([0.0, 0.01, 0.01, 0.01, -0.01, 3.0], n))]
+        time = data.draw(st.sampled_from(range(len(times))).map(times.__getitem__))
         signals[name] = SignalArray(
-            time,
-            value,
-            np.arange(n),
-            time + data.draw(st.sampled_from([np.nan, 0.0, 1.7e9])),
-            rng.random(n) < 0.5,
-            quantity=quantity if quantity in SIGNALS else "",
-            clock=data.draw(st.sampled_from(["firmware", "host"])),
-            stream=data.draw(st.sampled_from(["", "a", "b"])),
-        )
-    for finding in everything(Recording("x", "made", signals)):
+            time, data.draw(st.sampled_from(range(len(values))).map(values.__getitem__)), np.arange(n),
+            time + data.draw(st.sampled_from([np.nan, 0.0, 1.7e9])), rng.random(n) < 0.5, quantity=quantity,
+            clock=data.draw(st.sampled_from(["firmware", "host"])), stream=data.draw(st.sampled_from(["", "a", "b"])),
+        )  # fmt: skip
+    for finding in everything(Recording("x", "made", signals, {"claims": {"mass_kg": "0.03"}})):
         assert finding.text
         assert all(np.isfinite(v) for v in finding.evidence.values()) or finding.check == "numbers"
         assert all(a <= b for a, b in finding.intervals)
@@ -204,6 +203,11 @@ def test_a_stream_that_ends_early_or_begins_late():
     assert finding.evidence["silent_s"] == pytest.approx(8.0, abs=0.02)
     finding = only("gaps", made_flight(seconds=20.0, gaps={"motor": [(0.0, 3.0)]}))
     assert "first 3.0 s" in finding.text
+
+
+def test_gaps_are_no_other_fault():
+    recording = made_flight(seconds=25.0, gaps={"imu": [(8.0, 11.0)], "state": [(15.0, 15.3)]})
+    assert {f.check for f in everything(recording)} == {"gaps"}
 
 
 def test_events_have_no_gaps():

@@ -3,16 +3,18 @@
 import struct
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
-from received import packets, wait_for
-from relayed import connected
+from relayed import connected, packets, wait_for
 
 from crazyem.errors import LinkError, UsageError
 from crazyem.links import open_link
 from crazyem.links.base import LinkLost
 from crazyem.links.connection import new_crazyflie
 from crazyem.links.crazyflie import CrazyflieLink
+from crazyem.links.requests import land_command, send_until_confirmed
+from crazyem.signals.vocabulary import decoders, standard_variables
 
 NAMES = ("stateEstimateZ.x", "stateEstimateZ.y", "stateEstimateZ.z", "pm.vbat")
 
@@ -203,8 +205,102 @@ def test_riding_on_an_open_crazyflie(fake_peer):
         ("ftp://x", "no link for ftp"),
         ("udp://127.0.0.1", "needs a host and a port"),
         ("udp://127.0.0.1:99999", "needs a host and a port"),
+        ("mavlink:nonsense", "mavlink"),
     ],
 )
 def test_uris_that_name_no_link(uri, message):
     with pytest.raises(UsageError, match=message):
         open_link(uri)
+
+
+# --- the simulated firmware: real tables, real blocks, a take-off ---
+
+
+def test_standard_blocks_stream_at_100_hz(resting):
+    with CrazyflieLink(resting.uri) as link:
+        blocks = link.subscribe(standard_variables(link.log_variables), 100.0)
+        came = packets(link, 300)
+        statistics = link.statistics()
+    assert len(blocks) == 3
+    assert statistics.lost == 0
+    table = decoders(blocks)
+    samples = [s for p in came for s in table[p.block].decode(p)]
+    assert {s.signal for s in samples} >= {
+        "position", "velocity", "attitude", "body_rate", "specific_force", "motor_command", "voltage", "flying",
+    }  # fmt: skip
+    force = [s.value for s in samples if s.signal == "specific_force"]
+    mean = [sum(v[i] for v in force) / len(force) for i in range(3)]
+    assert mean == pytest.approx([0.0, 0.0, 9.81], abs=0.1)  # at rest on the ground
+
+
+def test_a_second_client_can_take_off_after_the_first_has_commanded(resting):
+    with CrazyflieLink(resting.uri) as first:
+        first.send_hover(0.0, 0.0, 0.0, 0.0)
+    with CrazyflieLink(resting.uri) as second:
+        blocks = second.subscribe(["stateEstimate.x", "stateEstimate.y", "stateEstimate.z"], 50.0)
+        second.take_off(0.5, 1.0)
+        table = decoders(blocks)
+        for packet in packets(second, 200):  # 4 s of the drone's clock
+            if any(s.value[2] > 0.2 for s in table[packet.block].decode(packet)):
+                return
+    raise AssertionError("it did not take off")
+
+
+# --- commands whose arrival counts: sent until they are confirmed, and given up in time ---
+
+
+class Drone:
+    """A Crazyflie that answers the n-th packet, and others' packets before it."""
+
+    def __init__(self, *, answers, error=0, noise=()):
+        self.link, self.sent, self.callbacks = object(), [], []
+        self.packet_received = SimpleNamespace(
+            add_callback=self.callbacks.append, remove_callback=self.callbacks.remove
+        )
+        self._answers, self._error, self._noise = answers, error, noise
+
+    def send_packet(self, packet):
+        self.sent.append((packet.port, packet.channel, bytes(packet.data)))
+        for port, channel, data in self._noise:
+            self._receive(port, channel, data)
+        if len(self.sent) == self._answers:
+            self._receive(8, 0, bytes([packet.data[0], 0, 0, self._error]))
+
+    def _receive(self, port, channel, data):
+        for callback in list(self.callbacks):
+            callback(SimpleNamespace(port=port, channel=channel, data=bytearray(data)))
+
+
+def test_the_command_is_the_firmwares():
+    # uint8 command 8, uint8 group, float height, float yaw, bool use current yaw, float duration: packed, little endian
+    assert land_command(0.25, 2.0) == b"\x08\x00" + struct.pack("<f", 0.25) + bytes(4) + b"\x01" + struct.pack(
+        "<f", 2.0
+    )
+
+
+@pytest.mark.parametrize("lost", [0, 1, 5])
+def test_it_is_sent_until_it_is_confirmed(lost):
+    drone = Drone(answers=lost + 1)
+    assert send_until_confirmed(drone, land_command(0.0, 2.0), timeout=60.0, repeat_after=0.001)
+    assert drone.sent == [(8, 0, land_command(0.0, 2.0))] * (lost + 1)
+    assert drone.callbacks == []
+
+
+@pytest.mark.parametrize(
+    "drone",
+    [
+        Drone(answers=0),
+        Drone(answers=1, error=16),  # the supervisor refuses
+        Drone(answers=0, noise=[(8, 0, b"\x07\x00\x00\x00"), (5, 0, b"\x08\x00\x00\x00"), (8, 0, b"\x08")]),
+    ],
+)
+def test_silence_refusals_and_other_answers_are_no_confirmation(drone):
+    assert not send_until_confirmed(drone, land_command(0.0, 2.0), timeout=0.05, repeat_after=0.01)
+    assert drone.callbacks == []
+
+
+def test_a_lost_link_ends_it_at_once():
+    drone = Drone(answers=1)
+    drone.link = None
+    assert not send_until_confirmed(drone, land_command(0.0, 2.0), timeout=60.0, repeat_after=1.0)
+    assert drone.sent == []

@@ -9,8 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 from fake_peer import FakePeer
-from received import packets, take, wait_for
-from relayed import connected, down, now_on, relayed, up
+from relayed import connected, down, now_on, packets, relayed, take, up, wait_for
 
 from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import LinkLost, Packet
@@ -320,23 +319,12 @@ def test_blocks_that_are_gone_are_created_anew(clock_peer, lost):
         assert relay.engine.counts.fates["up"]["received"]
 
 
-def test_a_restarted_drone_is_not_taken_for_the_same(clock_peer, lost):
-    clock_peer.first_stamp = 50_000
-    with relayed(clock_peer.uri) as relay, connected(relay.uri) as link:
-        link.subscribe(NAMES, 100.0)
-        packets(link, 20)
-        now_on(relay, down("silence"))
-        lost(link)
-        clock_peer.first_stamp = 0
-        now_on(relay)
-        with pytest.raises(LinkError, match="was restarted"):
-            link.reconnect(60.0)
-        assert not link.can_reconnect
-        assert not any(isinstance(p, Packet) and p.firmware_time_ms < 50_000 for p in take(link, 0.3))
+def restarted(peer, monkeypatch):
+    peer.first_stamp = 0
 
 
-def test_a_packet_from_before_a_restart_does_not_hide_the_restart(clock_peer, lost, monkeypatch):
-    clock_peer.first_stamp = 50_000
+def restarted_and_late(peer, monkeypatch):
+    """A packet from before the restart comes after it."""
     check = Reconnector._check_tables
 
     def after_an_old_packet(self, blocks):
@@ -345,28 +333,32 @@ def test_a_packet_from_before_a_restart_does_not_hide_the_restart(clock_peer, lo
         check(self, blocks)
 
     monkeypatch.setattr(Reconnector, "_check_tables", after_an_old_packet)
+    peer.first_stamp = 0
+
+
+def with_other_firmware(peer, monkeypatch):
+    answer = peer._answer
+    peer._answer = lambda r: [b"\x5c\x03\4\0CRC!\x10\x80"] if r[:2] in (b"\x5c\3", b"\x50\3") else answer(r)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [(restarted, "was restarted"), (restarted_and_late, "was restarted"), (with_other_firmware, "Another firmware")],
+    ids=["restarted", "restarted, with a packet from before", "with other firmware"],
+)
+def test_another_drone_is_not_taken_for_the_same(clock_peer, lost, monkeypatch, change, says):
+    clock_peer.first_stamp = 50_000
     with relayed(clock_peer.uri) as relay, connected(relay.uri) as link:
         link.subscribe(NAMES, 100.0)
         packets(link, 20)
         now_on(relay, down("silence"))
         lost(link)
-        clock_peer.first_stamp = 0
+        change(clock_peer, monkeypatch)
         now_on(relay)
-        with pytest.raises(LinkError, match="was restarted"):
-            link.reconnect(60.0)
-
-
-def test_another_firmware_is_not_taken_for_the_same(clock_peer, lost):
-    with relayed(clock_peer.uri) as relay, connected(relay.uri) as link:
-        link.subscribe(NAMES, 100.0)
-        now_on(relay, down("silence"))
-        lost(link)
-        answer = clock_peer._answer
-        clock_peer._answer = lambda r: [b"\x5c\x03\4\0CRC!\x10\x80"] if r[:2] in (b"\x5c\3", b"\x50\3") else answer(r)
-        now_on(relay)
-        with pytest.raises(LinkError, match="Another firmware"):
+        with pytest.raises(LinkError, match=says):
             link.reconnect(60.0)
         assert not link.can_reconnect
+        assert not any(isinstance(p, Packet) and p.firmware_time_ms < 50_000 for p in take(link, 0.3))
 
 
 def test_a_drone_that_stays_away_ends_in_time_and_can_be_aborted(clock_peer, lost):

@@ -5,17 +5,16 @@ import os
 import queue
 import socket
 import threading
-import time
 import tty
 
 import pytest
 from autopilots import ARDUPILOT, PX4, FakeAutopilot
+from fake_drone import until
 from mavlink_pilot import free_port
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from received import wait_for
+from relayed import wait_for
 
 from crazyem.errors import LinkError, UsageError
-from crazyem.links import open_link
 from crazyem.links.base import LinkLost
 from crazyem.links.mavlink.frames import FrameParser, number_of
 from crazyem.links.mavlink.link import MavlinkLink
@@ -79,13 +78,6 @@ def of(found, signal):
     return [s for s in found if s.signal == signal]
 
 
-def wait(condition, seconds=60.0):
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.005)
-
-
 def test_a_px4_is_identified_and_its_streams_become_signals():
     with streaming() as (link, drone, blocks):
         assert (link.autopilot, link.simulated) == (PX4, False)
@@ -108,7 +100,7 @@ def test_a_px4_is_identified_and_its_streams_become_signals():
 
 def test_an_ardupilot_without_intervals_is_asked_the_older_way():
     with streaming(ARDUPILOT, modern=False, old=True) as (link, drone, blocks):
-        wait(lambda: set(drone.groups) == {1, 2, 3, 6, 10, 11})
+        until(lambda: set(drone.groups) == {1, 2, 3, 6, 10, 11})
         assert drone.groups[6] == 50
         drone.stream(0.1)
         found = samples(link, blocks, arrived(link))
@@ -223,7 +215,7 @@ def test_nan_and_absurd_stamps_become_no_packets():
         drone.send(mavlink.MAVLink_local_position_ned_message(drone.ms, nan, 0, 0, 0, 0, 0))
         drone.send(mavlink.MAVLink_local_position_ned_message((1 << 32) - 1, 1, 1, 1, 0, 0, 0))
         drone.send(mavlink.MAVLink_attitude_quaternion_message(drone.ms, 9, 9, 9, 9, 0, 0, 0))
-        wait(lambda: int(link.account()["refused"]) >= 3)
+        until(lambda: int(link.account()["refused"]) >= 3)
         assert not [p for p in drain(link) if isinstance(p, LinkLost) or p.block in (0, 1)]
 
 
@@ -237,7 +229,7 @@ def test_frames_are_handed_on_as_they_came():
         sent = []
         drone.mangle = lambda data: sent.append(data) or [data]
         drone.stream(0.05)
-        wait(lambda: len(kept) >= len(sent))
+        until(lambda: len(kept) >= len(sent))
         assert kept[: len(sent)] == sent
         assert len(FrameParser().feed(b"".join(kept))) == len(kept)
 
@@ -348,7 +340,7 @@ def test_a_serial_port_that_is_pulled_out_is_a_lost_drone(monkeypatch):
     with contextlib.closing(MavlinkLink(f"mavlink:{os.ttyname(slave)}:57600")) as link:
         link.connect(60.0)
         link.start_streams(100.0)
-        wait(lambda: link.packets.qsize() > 5)
+        until(lambda: link.packets.qsize() > 5)
         stop.set()
         thread.join()
         os.close(slave)
@@ -367,9 +359,3 @@ def test_it_cannot_be_flown_and_closes_twice():
         link.close()
         with pytest.raises(LinkError, match="not open"):
             link.read_parameter("X")
-
-
-def test_open_link_knows_the_scheme():
-    assert isinstance(open_link("mavlink:udpin:127.0.0.1:14550"), MavlinkLink)
-    with pytest.raises(UsageError):
-        open_link("mavlink:nonsense")

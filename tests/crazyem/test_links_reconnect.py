@@ -2,7 +2,7 @@
 
 import itertools
 import math
-import queue
+import re
 import time
 
 import fake_drone as fake
@@ -13,7 +13,7 @@ from relayed import down, now_on, relayed, up
 from crazyem.control.trajectories import excite, hover
 from crazyem.errors import CrazyemError, LinkError
 from crazyem.estimation.online import OnlineEstimator
-from crazyem.links.base import AnotherDroneError, LinkLost, LinkStatistics, Outage, ParameterWrite, link_account
+from crazyem.links.base import AnotherDroneError, LinkLost, LinkStatistics, Outage, link_account
 from crazyem.links.crazyflie import CrazyflieLink
 from crazyem.live.controllers import LEE
 from crazyem.live.flight import Flight, FlightPlan
@@ -30,19 +30,14 @@ class LosingLink(fake.FakeLink):
     def __init__(self, *, gone_at=7000, comes_back=True, **options):
         super().__init__(**options)
         self.gone_at, self.comes_back = gone_at, comes_back
-        self.gone = False
-        self.can_reconnect = True
-        self._all = self.packets
-        self.packets = queue.SimpleQueue()
-        self.refused = 0
+        self.gone, self.can_reconnect, self.refused = False, True, 0
 
-    def connect(self, timeout=15.0):
-        pass
-
-    def _run(self):
-        passed, self.packets = self.packets, _Filter(self)
-        self._passed = passed
-        super()._run()
+    def send(self, packet):
+        if self.gone_at is not None and self.fm > self.gone_at:
+            self.gone_at, self.gone = None, True
+            self.packets.put(LinkLost("it was away.", self.host_clock()))
+        if not self.gone:
+            self.packets.put(packet)
 
     def write_parameter(self, name, value, timeout=1.0):
         if self.gone:
@@ -64,27 +59,6 @@ class LosingLink(fake.FakeLink):
         return Outage("it was away.", 0.1, float(before), float(self.fm), 0)
 
 
-class _Filter:
-    """What the fake puts into its queue, less what an outage swallows."""
-
-    def __init__(self, link):
-        self.link = link
-
-    def put(self, item):
-        link = self.link
-        if link.gone_at is not None and link.fm > link.gone_at:
-            link.gone_at, link.gone = None, True
-            link._passed.put(LinkLost("it was away.", link.host_clock()))
-        if not link.gone:
-            link._passed.put(item)
-
-    def get(self, timeout=None):
-        return self.link._passed.get(timeout=timeout)
-
-    def get_nowait(self):
-        return self.link._passed.get_nowait()
-
-
 @pytest.fixture(params=["a session's own threads", "a scheduler's"])
 def scheduler(request):
     """One drone among others is received by the thread that receives for all; it must outlive an outage as well."""
@@ -94,25 +68,29 @@ def scheduler(request):
         one.close()
 
 
-def fly(link, kind=excite, duration=8.0, recorder=None, scheduler=None):
-    session = Session(
-        link, vehicle=load_vehicle("cf2"), estimator=fake.FakeEstimator(), recorder=recorder, scheduler=scheduler
-    )
-    plan = FlightPlan(
-        trajectory=lambda position, yaw: kind(position=position, yaw=yaw, duration=duration), controller=LEE
-    )
+def plan_of(kind, duration):
+    return FlightPlan(lambda position, yaw: kind(position=position, yaw=yaw, duration=duration), LEE)
+
+
+def fly(link, kind=excite, duration=8.0, scheduler=None):
+    """The session of a flight, and what ended it early."""
+    session = Session(link, vehicle=load_vehicle("cf2"), estimator=fake.FakeEstimator(), scheduler=scheduler)
     session.start()
+    error = None
     try:
-        Flight(session, plan).fly()
+        Flight(session, plan_of(kind, duration)).fly()
+    except LinkError as e:
+        error = e
     finally:
         session.close()
         link.close()
-    return session
+    return session, error
 
 
 def test_a_flight_goes_on_after_an_outage(scheduler):
     link = LosingLink(speed=5.0)
-    session = fly(link, scheduler=scheduler)
+    session, error = fly(link, scheduler=scheduler)
+    assert error is None
     assert [o.reason for o in session.outages] == ["it was away."]
     assert session.lost is None
     assert any("was gone for 0.1 s" in n for n in session.history.notices)
@@ -132,8 +110,7 @@ def test_a_flight_goes_on_after_an_outage(scheduler):
 def test_an_outage_that_lasts_ends_the_flight_in_one_sentence(scheduler, can_reconnect, message):
     link = LosingLink(speed=5.0, comes_back=False)
     link.can_reconnect = can_reconnect
-    with pytest.raises(LinkError, match=message):
-        fly(link, scheduler=scheduler)
+    assert re.search(message, str(fly(link, scheduler=scheduler)[1]))
 
 
 def test_after_a_restart_of_the_firmware_the_notes_agree(scheduler):
@@ -150,13 +127,8 @@ def test_after_a_restart_of_the_firmware_the_notes_agree(scheduler):
         raise AnotherDroneError("The drone was restarted: what it knew of the flight is gone.")
 
     link.write_parameter, link.reconnect = write_and_restart, another
-    session = Session(link, vehicle=load_vehicle("cf2"), estimator=fake.FakeEstimator(), scheduler=scheduler)
-    plan = FlightPlan(lambda position, yaw: hover(position=position, yaw=yaw, duration=60.0), LEE)
-    session.start()
-    with pytest.raises(LinkError, match="was restarted"):
-        Flight(session, plan).fly()
-    session.close()
-    link.close()
+    session, error = fly(link, hover, 60.0, scheduler)
+    assert "was restarted" in str(error)
     notes = session.history.notices
     assert [n for n in notes if "of its start" in n]
     assert not [n for n in notes if "put back" in n or "written back" in n or "may keep" in n]
@@ -176,29 +148,12 @@ def test_a_write_that_falls_into_an_outage_is_made_up_for(scheduler):
         return write(name, value, timeout)
 
     link.write_parameter = lost_with_the_first_push
-    session = fly(link, hover, scheduler=scheduler)
+    session, error = fly(link, hover, scheduler=scheduler)
+    assert error is None
     assert link.refused
     assert session.history.pushes
     assert all(p.verified for p in session.history.pushes)
     assert link.values["ctrlLee.mass"] == pytest.approx(0.036, rel=0.01)
-
-
-def test_every_attempt_of_a_write_is_recorded():
-    from crazyem.live.guard import Decision, Guard
-    from crazyem.live.history import History
-    from crazyem.live.push import WRITE_ATTEMPTS, Pusher
-
-    link = fake.FakeLink(lose_echo_after=0)
-    nominal = {"mass": 0.03, "Ixx": 1e-5, "Iyy": 1e-5, "Izz": 1e-5}
-    guard = Guard(LEE, nominal=nominal, originals=dict(link.values))
-    written: list[ParameterWrite] = []
-    history = History()
-    pusher = Pusher(link, guard, gate=fake.OPEN, history=history, on_write=written.append)
-    pusher.submit(Decision(1.0, writes=(("ctrlLee.mass", 0.03),)))
-    pusher.close()
-    assert len(written) == WRITE_ATTEMPTS
-    assert [p.verified for p in history.pushes] == [False]
-    assert guard.stopped
 
 
 def test_the_account_of_a_link():
@@ -216,41 +171,55 @@ def test_the_account_of_a_link():
 # --- the simulated firmware -----------------------------------------------------------------------------------------
 
 
-def flown(uri, tmp_path, faults, *, at):
-    """A recorded 12 s flight through a relay, with faults from `at` s after take-off on: session and its error."""
-    vehicle = load_vehicle("cf2")
+def flown(uri, faults, *, path="", kind=excite, duration=9.0, at=0.0):
+    """A flight through a relay, recorded at `path`, with faults from `at` s of its trajectory on: session and error."""
+    vehicle, recorder, begun, error = load_vehicle("cf2"), None, [], None
     with relayed(uri) as relay:
         link = CrazyflieLink(relay.uri)
         link.connect(30.0)
-        recorder = open_recorder(str(tmp_path / "f.mcap"), configuration={}, vehicle=vehicle, link=link)
+        if path:
+            recorder = open_recorder(str(path), configuration={}, vehicle=vehicle, link=link)
         session = Session(link, vehicle=vehicle, estimator=OnlineEstimator(vehicle), recorder=recorder)
-        plan = FlightPlan(
-            trajectory=lambda position, yaw: excite(position=position, yaw=yaw, duration=9.0), controller=LEE
-        )
-        begun, error = [], None
 
         def progress(phase, seconds):
-            if phase == "excite" and not begun and seconds > at:
+            if phase == kind.__name__ and not begun and seconds > at:
                 begun.append(seconds)
                 now_on(relay, *faults)
 
         try:
             session.start()
-            Flight(session, plan, progress=progress).fly()
+            Flight(session, plan_of(kind, duration), progress=progress).fly()
         except CrazyemError as e:
             error = e
         session.close()
-        recorder.close()
+        if recorder is not None:
+            recorder.close()
         link.close()
         assert begun
         return session, error
 
 
 @pytest.mark.slow
+def test_setpoints_that_the_plan_to_land_overtakes_do_not_drop_the_drone(simulator):
+    """Every setpoint is 0.1 s late, whatever else passes at once: the last ones arrive after the command to land.
+
+    The firmware forgets a plan when a setpoint comes, and stops the motors when it is released without one.
+    """
+    late = up("reorder", rate=1.0, distance=100, kinds=("setpoint.generic",))
+    session, error = flown(simulator("--seed", "5").uri, [late], kind=hover, duration=3.0)
+    assert error is None
+    track = session.history.track_array()
+    time_, height = track[:, 0], track[:, 3]
+    falling = (height[:-10] - height[10:]) / (time_[10:] - time_[:-10])
+    assert height.max() > 0.5
+    assert falling.max() < 1.2  # m/s over a tenth of a second; cut at 1 m it would come down with 4
+
+
+@pytest.mark.slow
 def test_deaf_for_three_seconds_in_flight(simulator, tmp_path):
     """Only the way down is lost: setpoints go on, the drone flies on, the window is kept, the recording too."""
     drone = simulator("--seed", "3")
-    session, error = flown(drone.uri, tmp_path, [down("silence", end=3.0)], at=2.0)
+    session, error = flown(drone.uri, [down("silence", end=3.0)], path=tmp_path / "f.mcap", at=2.0)
     assert error is None
     (outage,) = session.outages
     assert 2.5 < (outage.after_ms - outage.before_ms) / 1000 < 4.5
@@ -274,10 +243,10 @@ def test_deaf_for_three_seconds_in_flight(simulator, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_drone_that_heard_nothing_for_three_seconds_has_fallen(simulator, tmp_path):
+def test_a_drone_that_heard_nothing_for_three_seconds_has_fallen(simulator):
     """The firmware cuts the motors two seconds after the last setpoint: no return undoes that, but we say so."""
     drone = simulator("--seed", "4")
-    session, error = flown(drone.uri, tmp_path, [down("silence", end=3.5), up("silence", end=3.5)], at=1.0)
+    session, error = flown(drone.uri, [down("silence", end=3.5), up("silence", end=3.5)], at=1.0)
     assert len(session.outages) == 1
     assert "fell while the link was gone" in str(error)
     assert "locked" in str(error)

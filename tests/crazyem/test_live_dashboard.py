@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fake_drone import FakeEstimator, FakeLink
+from fake_drone import FakeEstimator, FakeLink, until
 from fake_flight import Recorder
 from hypothesis import given
 from hypothesis import strategies as st
@@ -149,13 +149,6 @@ def keyboard():
     yield lambda text: os.write(master, text.encode()), slave
     os.close(master)
     os.close(slave)
-
-
-def until(condition, seconds=60.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.01)
 
 
 def screen(file=None):

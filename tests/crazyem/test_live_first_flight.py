@@ -15,6 +15,7 @@ Parameters of one flight are nearly independent (torques about different axes), 
 """
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +24,11 @@ from scipy.stats import binom
 
 from benchmarks.indi_flight import GuardedFlight
 from crazyem.control.trajectories import excite, hover
+from crazyem.estimation.result import Estimate
 from crazyem.estimation.steps import estimator_for
 from crazyem.live.controllers import LEE
 from crazyem.vehicle import load_vehicle
-from firmware_sim.scenario import load_scenario
+from firmware_sim.scenario import load_scenario, parse_scenario
 
 TRUTH = {"mass": 0.036, "Ixx": 2.0e-5, "Iyy": 2.1e-5, "Izz": 3.6e-5}  # of the scenario, typed here on purpose
 RMS = {"mass": 0.0022, "Ixx": 0.03, "Iyy": 0.03, "Izz": 0.03}
@@ -91,3 +93,26 @@ def test_hover_is_honest_about_inertia():
             low, high = e[name].ci95
             assert (high - low) / TRUTH[name] > 0.1
     assert sum(covered(estimates, names).values()) >= fewest_covered(len(names) * len(estimates))
+
+
+# --- a wrong mass that is pushed in flight is taken back; the other rules: test_live_write_supervisor.py ---
+
+
+def biased(estimate: Estimate) -> Estimate:
+    """As if a sensor lied: the mass times 1.3, everything else as it is."""
+    p = estimate["mass"]
+    low, high = (1.3 * x for x in p.ci95)
+    wrong = replace(p, value=1.3 * p.value, sd=1.3 * p.sd, ci95=(low, high))
+    return replace(estimate, parameters={**estimate.parameters, "mass": wrong})
+
+
+def test_a_lie_about_the_mass_is_taken_back_in_flight() -> None:
+    flight = GuardedFlight(parse_scenario({}, "plain"), 1, load_vehicle("cf2"), LEE.number, tamper=biased)
+    flight.fly(hover(position=(0.0, 0.0, 1.0), duration=12.0))
+    assert not flight.crashed
+    pushed = [value for _, name, value in flight.writes if name == "ctrlLee.mass"]
+    assert pushed, flight.history.guard
+    assert max(pushed) > 0.033  # it was believed
+    assert flight.reverted
+    assert flight.read("ctrlLee.mass") == pytest.approx(0.029, rel=0.01)
+    assert any("flew worse after" in n for n in flight.history.notices)

@@ -39,14 +39,6 @@ def test_keys_come_one_by_one_without_return_and_in_order(terminal):
         assert keys.read(0.0) == ""
 
 
-def test_nothing_is_echoed_and_control_c_stays_a_signal(terminal):
-    _, slave = terminal
-    before = termios.tcgetattr(slave)
-    with Keys(slave):
-        assert modes(slave) == termios.ISIG
-    assert termios.tcgetattr(slave) == before
-
-
 def test_keys_pressed_at_once_are_not_lost_and_arrow_keys_are_no_letters(terminal):
     master, slave = terminal
     with Keys(slave) as keys:
@@ -59,18 +51,19 @@ def test_keys_pressed_at_once_are_not_lost_and_arrow_keys_are_no_letters(termina
         assert keys.read(5.0) == "m"
 
 
-@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
-def test_the_terminal_is_as_before_after_an_exception(terminal, error):
+@pytest.mark.parametrize("error", [None, ValueError, KeyboardInterrupt, SystemExit])
+def test_nothing_is_echoed_control_c_stays_a_signal_and_the_terminal_is_as_before(terminal, error):
     _, slave = terminal
     before = termios.tcgetattr(slave)
 
-    def fails():
+    def reads():
         with Keys(slave):
             assert modes(slave) == termios.ISIG
-            raise error
+            if error:
+                raise error
 
-    with pytest.raises(error):
-        fails()
+    with pytest.raises(error) if error else contextlib.nullcontext():
+        reads()
     assert termios.tcgetattr(slave) == before
 
 
@@ -87,23 +80,20 @@ def test_ending_twice_or_without_beginning_does_nothing(terminal):
     assert termios.tcgetattr(slave) == before
 
 
-def test_a_pipe_gives_no_keys_and_does_not_wait():
+NO_TERMINALS = {"a pipe": Keys, "a closed file": lambda pipe: Keys(-1), "nothing": lambda pipe: Keys()}
+
+
+@pytest.mark.parametrize("source", NO_TERMINALS)
+def test_what_is_no_terminal_gives_no_keys_and_does_not_wait(monkeypatch, source):
+    monkeypatch.setattr(sys, "stdin", None)
     read, write = os.pipe()
     try:
-        with Keys(read) as keys:
+        with NO_TERMINALS[source](read) as keys:
             assert not keys.reading
             assert keys.read(60.0) == ""
     finally:
         os.close(read)
         os.close(write)
-
-
-def test_closed_and_missing_files_are_no_terminals(monkeypatch):
-    monkeypatch.setattr(sys, "stdin", None)
-    with Keys() as keys:
-        assert not keys.reading
-    with Keys(-1) as keys:
-        assert keys.read(60.0) == ""
 
 
 def test_a_terminal_that_hangs_up_ends_the_keys_once(terminal):

@@ -133,13 +133,6 @@ def test_what_may_write(words, mode):
     assert write_rules(parser().parse_args(["fly", *words])).mode == mode
 
 
-def test_contradictions_are_refused(capsys):
-    assert main(["fly", "--push", "--no-push"]) == 2
-    assert main(["fly", "--confirm", "--dry-run"]) == 2
-    assert main(["fly", "--policy", "nowhere.toml"]) == 2
-    assert "nowhere.toml" in capsys.readouterr().err
-
-
 def test_a_policy_of_a_file_reaches_the_guard(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text("[push]\nslew = 0.05\n")

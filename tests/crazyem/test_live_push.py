@@ -48,10 +48,10 @@ def a_set(changed=None):
     return Decision(1.0, writes=writes_for(LEE, changed or NEW, beliefs=NOMINAL, originals=ORIGINALS))
 
 
-def run(drone, *decisions, guard=None, **kw):
+def run(drone, *decisions, guard=None, known=ORIGINALS, **kw):
     guard, history = guard or Guard(LEE, nominal=NOMINAL, originals=ORIGINALS), History()
     done = []
-    pusher = Pusher(drone, guard, gate=fake.OPEN, history=history, timeout=0.01, known=ORIGINALS,
+    pusher = Pusher(drone, guard, gate=fake.OPEN, history=history, timeout=0.01, known=known,
                     on_done=lambda d, why: done.append((d.kind, not why)), **kw)  # fmt: skip
     for decision in decisions:
         pusher.submit(decision)
@@ -75,9 +75,11 @@ def test_a_whole_set():
 def test_a_set_that_breaks_anywhere_is_undone_completely(at, applied):
     """All attempts at write `at` go unanswered, whether it arrived or not; then the drone answers again."""
     drone = Drone(lambda n: at < n <= at + WRITE_ATTEMPTS, applied)
-    guard, history, done, pusher = run(drone, a_set(), a_set())
+    attempts = []
+    guard, history, done, pusher = run(drone, a_set(), a_set(), on_write=attempts.append)
     assert drone.values == ORIGINALS
     assert pusher.known == ORIGINALS
+    assert len(attempts) == drone.attempts
     assert done == [("push", False), ("push", False)]
     assert "not confirmed" in guard.stopped
     assert any("undone" in n for n in history.notices)
@@ -85,21 +87,19 @@ def test_a_set_that_breaks_anywhere_is_undone_completely(at, applied):
     assert sum(p.verified for p in history.pushes) == len(drone.log) - (WRITE_ATTEMPTS if applied else 0)
 
 
-def test_one_lost_echo_is_tried_again():
-    drone = Drone(lambda n: n == 3)
-    guard, _, done, _ = run(drone, a_set())
+@pytest.mark.parametrize(
+    ("lost", "outage"), [((3,), False), ((5, 6, 7), True)], ids=["one echo", "three, with the link"]
+)
+def test_lost_echoes_are_asked_for_again(lost, outage):
+    """The link goes in the third attempt at the fifth write, is noticed to be gone only then, and comes back.
+
+    An attempt during which the link was lost counts for nothing.
+    """
+    drone = Drone(lambda n: n in lost)
+    guard, _, done, _ = run(drone, a_set(), outages=lambda: int(outage and drone.attempts >= lost[-1]))
     assert done == [("push", True)]
     assert not guard.stopped
-    assert drone.attempts == len(a_set().writes) + 1
-
-
-def test_an_attempt_during_which_the_link_was_lost_counts_for_nothing():
-    """The link goes in the third attempt at the fifth write, is noticed to be gone only then, and comes back."""
-    drone = Drone(lambda n: 5 <= n <= 7)
-    guard, _, done, _ = run(drone, a_set(), outages=lambda: int(drone.attempts >= 7))
-    assert done == [("push", True)]
-    assert not guard.stopped
-    assert drone.attempts == len(a_set().writes) + 3
+    assert drone.attempts == len(a_set().writes) + len(lost)
 
 
 def test_a_link_that_keeps_going_does_not_keep_a_write_for_ever():
@@ -116,6 +116,12 @@ def test_what_cannot_be_undone_is_said():
     assert any("could not be written back" in n for n in history.notices)
     assert math.isnan(pusher.known["ctrlLee.mass"])
     assert drone.attempts == 4 + 2 * WRITE_ATTEMPTS
+
+
+def test_what_was_not_known_before_is_not_undone():
+    guard, history, _, _ = run(Drone(lambda n: True), a_set(), known={})
+    assert guard.stopped
+    assert [(p.purpose, p.verified) for p in history.pushes] == [("push", False)]
 
 
 @pytest.mark.parametrize("error", [LinkError("gone."), RuntimeError("a fault nobody foresaw")])

@@ -165,13 +165,3 @@ def test_three_lines_give_an_existing_cflib_script_estimates(simulator, monkeypa
         assert scf.cf.is_connected()
         assert not [b for b in scf.cf.log.log_blocks if b.started]
         scf.cf.high_level_commander.land(0.0, 1.0)
-
-
-def test_attaching_to_a_closed_crazyflie_is_refused():
-    from cflib.crazyflie import Crazyflie
-
-    import crazyem
-    from crazyem.errors import UsageError
-
-    with pytest.raises(UsageError, match="not connected"):
-        crazyem.attach(Crazyflie(), vehicle="cf2")

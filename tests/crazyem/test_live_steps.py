@@ -181,19 +181,16 @@ def test_a_wrong_mass_after_a_step_is_noticed_when_the_drone_should_be_back():
     assert 9.0 < t < 12.0
 
 
-def test_oscillation_and_great_distance_alarm_at_any_time():
-    for what in ({"tremble": 12.0}, {"error": 1.2}):
-        watch = written()
-        assert fly(watch, WRITE, 1.0)[0] == ""
-        watch.on_mass_step(began=6.0, now=6.1, real=None)
-        assert fly(watch, 6.1, 1.0, **what)[0] == "worse"
-
-
-def test_an_estimator_that_stalls_in_a_step_does_not_blind_the_watch():
+@pytest.mark.parametrize(
+    ("what", "seconds"),
+    [({"tremble": 12.0}, 1.0), ({"error": 1.2}, 1.0), ({"error": 0.4}, 8.0)],
+    ids=["oscillation", "great distance", "an estimator that stalls in the step"],
+)
+def test_what_alarms_while_a_step_is_undecided(what, seconds):
     watch = written()
     assert fly(watch, WRITE, 1.0)[0] == ""
     watch.on_mass_step(began=6.0, now=6.1, real=None)
-    assert fly(watch, 6.1, 8.0, error=0.4)[0] == "worse"
+    assert fly(watch, 6.1, seconds, **what)[0] == "worse"
 
 
 def test_after_a_gust_it_is_judged_again():

@@ -162,27 +162,6 @@ def test_drones_are_watched_together_and_commanded_never(fake):
     assert all(not fake[f"fake://{i}"].calls for i in range(3))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["fly", "--uri", "udp://h:1", "--uri", "udp://h:1"], "given twice"),
-        (["fly", "--uri", "udp://h:1", "--swarm", "s.toml"], "not both"),
-        (["fly", "--swarm", "no.toml"], "cannot read the swarm file no.toml"),
-        (["fly", "--uri", "udp://h:1", "--seed", "3"], "built-in simulator"),
-        (["fly", "--uri", "mavlink:udpin:h:1"], "ground station"),
-        (["watch", "--uri", "udp://h:1", "--push"], "watched only"),
-        (["watch"], "needs a URI"),
-        (["fly", "--live"], "--live needs a terminal"),
-        (["fly", "--uri", "udp://h:1", "--trajectory", "loop"], "unknown trajectory"),
-    ],
-)
-def test_wrong_arguments_are_one_sentence(capsys, arguments, says):
-    assert main(arguments) == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("crazyem: ")]
-    assert len(lines) == 1
-    assert says in lines[0]
-
-
 def test_a_drone_that_never_flew_is_a_row_with_its_reason(fake, monkeypatch):
     class Nothing(FakeEstimator):
         def finish(self):

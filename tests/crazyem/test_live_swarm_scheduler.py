@@ -5,6 +5,7 @@ import time
 
 import pytest
 import synthetic
+from fake_drone import until
 
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.live.scheduler import LONGEST_DEFERRAL, TIME_SLICE, Scheduler, UpdateThrottle
@@ -50,20 +51,13 @@ def test_one_thread_takes_in_for_all_until_it_is_told_not_to(scheduler):
     sources = {k: lambda k=k: bool(calls[k].append(threading.current_thread().name)) for k in calls}
     for source in sources.values():
         scheduler.poller.add(source)
-    _until(lambda: min(map(len, calls.values())) > 5)
+    until(lambda: min(map(len, calls.values())) > 5)
     scheduler.poller.remove(sources["a"])
     count = len(calls["a"])
     after = len(calls["b"])
-    _until(lambda: len(calls["b"]) > after + 5)
+    until(lambda: len(calls["b"]) > after + 5)
     assert len(calls["a"]) == count
     assert set(calls["a"] + calls["b"]) == {"crazyem-receive"}
-
-
-def _until(condition):
-    deadline = time.monotonic() + 60.0
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
 
 
 def test_a_mailbox_that_fails_ends_alone(scheduler):

@@ -328,50 +328,7 @@ def test_no_value_of_any_key_breaks_the_loader(value):
             load_mapping(f'[time]\ncolumn="t"\n[signals.voltage]\ncolumns=["v"]\n{key} = {text}\n', "mine.toml")
 
 
-# --- the presets against the numbers ---------------------------------------------------------------------------------
-
-
-def test_nanobench_streams_agree_with_each_other(shared_recordings):
-    for path in sorted((shared_recordings / "nanobench").glob("B3*.csv.gz")):
-        signals = open_recording(path).signals
-        vicon = Rotation.from_quat(signals["attitude"].value)
-        assert np.abs(vicon.as_euler("ZYX")[:, ::-1] - signals["euler"].value).max() < 1e-5
-        onboard, angles = signals["attitude@onboard"], signals["euler@onboard"]
-        both = ~onboard.marked & ~angles.marked
-        found = Rotation.from_quat(onboard.value[both]).as_euler("ZYX")[:, ::-1]
-        assert np.quantile(np.abs(found - angles.value[both]), 0.99) < 0.01  # two packets, up to 10 ms apart
-        aloft = signals["position"].value[:, 2] > 0.5
-        for name in ("position@onboard", "velocity@onboard"):
-            assert np.nanmedian(np.abs(signals[name].value - signals[name[:8]].value)[aloft]) < 0.1
-        force = signals["specific_force"].value
-        world = vicon.apply(force) - [0.0, 0.0, 9.81]
-        estimated = signals["acceleration@onboard"].value
-        both = np.isfinite(world).all(axis=1) & np.isfinite(estimated).all(axis=1) & aloft
-        assert np.corrcoef(world[both, 2], estimated[both, 2])[0, 1] > 0.9
-        assert np.polyfit(world[both, 2], estimated[both, 2], 1)[0] == pytest.approx(1.0, abs=0.15)
-        rate, gyro = signals["body_rate@vicon"].value, signals["body_rate"].value
-        both = np.isfinite(gyro).all(axis=1) & aloft
-        assert np.corrcoef(rate[both, 0], gyro[both, 0])[0, 1] > 0.5
-
-
-def test_nanobench_as_published(shared_recordings):
-    path = shared_recordings / "nanobench" / "B3_figure8_fast_rep1.csv.gz"
-    right, claimed = open_recording(path), open_recording(path, ReadOptions(as_published=True))
-    table = pd.read_csv(path)
-    assert claimed.signals["euler"].value[:, 2] == pytest.approx(np.radians(table["yaw"]))
-    assert claimed.signals["acceleration@onboard"].value[5] == pytest.approx(
-        right.signals["acceleration@onboard"].value[5] / 9.81
-    )
-    pitch = claimed.signals["euler@onboard"].value[:, 1]
-    assert pitch == pytest.approx(-right.signals["euler@onboard"].value[:, 1], nan_ok=True)
-    turn = Rotation.from_quat(table[["qx", "qy", "qz", "qw"]].to_numpy())
-    rate = table[["wx_vicon", "wy_vicon", "wz_vicon"]].to_numpy()
-    assert claimed.signals["body_rate@vicon"].value == pytest.approx(turn.inv().apply(rate))
-    assert claimed.metadata["claims"] == {"mass_kg": "0.027", "rate_hz": "100", "synchronised": "true"}
-    assert claimed.metadata["csv"]["as_published"] == "true"
-    same = ("position", "velocity", "attitude", "body_rate", "specific_force", "motor_command", "voltage")
-    for name in same:
-        assert np.array_equal(claimed.signals[name].value, right.signals[name].value, equal_nan=True)
+# --- the presets against the numbers; those of nanobench are reviewed in test_shared_expectations.py --------------
 
 
 def test_nanobench_voltage_has_its_own_samples_back(shared_recordings):
@@ -382,7 +339,7 @@ def test_nanobench_voltage_has_its_own_samples_back(shared_recordings):
         time = table["t"].to_numpy() - recording.origin
         inside = (time >= voltage.time[0]) & (time <= voltage.time[-1])
         drawn = np.interp(time, voltage.time, voltage.value[:, 0])[inside]
-        # the limit of corners(), see test_interpolation; all but a few rows agree to the rounding of the file
+        # the limit of corners(), see test_recordings_csv; all but a few rows agree to the rounding of the file
         error = np.abs(drawn - table["pwr_pm_vbat"][inside])
         assert error.max() < 1.05e-8
         assert np.quantile(error, 0.99) < 2e-9

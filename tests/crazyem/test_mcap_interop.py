@@ -116,17 +116,6 @@ def test_an_imported_recording_is_decoded_without_crazyem(tmp_path):
     assert pose[0]["pose"]["position"] == dict(zip("xyz", recording.signals["position"].value[0].tolist(), strict=True))
 
 
-def test_a_recovered_recording_is_decoded_without_crazyem(tmp_path):
-    path, target = tmp_path / "flight.mcap", tmp_path / "mended.mcap"
-    record_everything(path)
-    record_everything(path, append=True)
-    path.write_bytes(path.read_bytes()[: path.stat().st_size * 3 // 4])
-    recover(path, target)
-    found = read_elsewhere(target, tmp_path)
-    assert found["count"] == len(found["sequences"]) > 0
-    assert found["times"] == sorted(found["times"])
-
-
 def packets_in(path):
     try:
         return open_recording(path).signals["voltage"].time.size

@@ -1,8 +1,5 @@
 """What motor.m1..4 is: the real logs whose answer is known, each kind of evidence alone, and evidence at odds."""
 
-import csv
-import gzip
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -90,13 +87,6 @@ def test_crazypad_without_its_pwm_is_told_by_the_mixers_grid(shared_recordings):
         told = decide([table(columns)])
         assert told.meaning == "duty"
         assert 0.03 < told.evidence["mixer_share"] < 0.1  # 1/16 by chance
-
-
-def test_real_firmware_logged_pwm(shared_recordings):
-    with gzip.open(shared_recordings / "real_firmware" / "lee_brushless_39g.csv.gz", "rt") as file:
-        rows = list(csv.DictReader(file))
-    values = [np.array([float(row["value"]) for row in rows if row["name"] == name]) for name in MOTOR_VARIABLES]
-    assert decide([table(motors(values))]).meaning == "duty"
 
 
 # --- each kind of evidence ---

@@ -1,8 +1,6 @@
 """cfclient CSV: files written the way cfclient writes them come back exactly; sessions, wraps, cut and wrong files."""
 
-import csv
 import gzip
-import io
 import math
 import struct
 
@@ -12,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.errors import FileFormatError
-from crazyem.recordings import motor_meaning
 from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.csv.cfclient import read, recognises, recognises_folder
 from crazyem.recordings.finding import Grade
@@ -147,26 +144,27 @@ def test_stamps_wrap_inside_a_file_and_between_files(put):
     assert (signals["voltage"].time * 1000).round().astype(int).tolist() == [t for t, *_ in late]
 
 
-def test_flights_of_other_sessions_are_no_one_recording(put):
-    folder = put("state-20250301T10-00-00.csv", as_cfclient(STATE, rows_of(STATE))).parent
-    put("state-20250301T11-00-00.csv", as_cfclient(STATE, rows_of(STATE)))
-    assert not recognises_folder(folder)
-    folder = put("flight1.csv", as_cfclient(STATE, rows_of(STATE)), "renamed").parent
-    put("flight2.csv", as_cfclient(STATE, rows_of(STATE)), "renamed")
-    assert not recognises_folder(folder)
+STATE_FILE = as_cfclient(STATE, rows_of(STATE))
 
 
-def test_folders_with_other_things(put, tmp_path):
-    folder = put("state-20250301T10-00-00.csv", as_cfclient(STATE, rows_of(STATE))).parent
-    put("notes.txt", "windy")
-    assert recognises_folder(folder)
-    put("flight.mcap", b"\x89MCAP0\r\n")
-    assert not recognises_folder(folder)
-    folder = put("state-20250301T10-00-00.csv", as_cfclient(STATE, rows_of(STATE)), "mixed").parent
-    put("paper.csv", "t,x,y\n1,2,3\n", "mixed")
-    assert not recognises_folder(folder)
-    (tmp_path / "empty").mkdir()
-    assert not recognises_folder(tmp_path / "empty")
+@pytest.mark.parametrize(
+    ("files", "one_session"),
+    [
+        ({}, False),
+        ({"state-20250301T10-00-00.csv": STATE_FILE, "notes.txt": "windy"}, True),
+        ({"state-20250301T10-00-00.csv": STATE_FILE, "state-20250301T11-00-00.csv": STATE_FILE}, False),
+        ({"flight1.csv": STATE_FILE, "flight2.csv": STATE_FILE}, False),
+        ({"state-20250301T10-00-00.csv": STATE_FILE, "flight.mcap": b"\x89MCAP0\r\n"}, False),
+        ({"state-20250301T10-00-00.csv": STATE_FILE, "paper.csv": "t,x,y\n1,2,3\n"}, False),
+    ],
+    ids=["nothing", "a session and notes", "two sessions", "files renamed", "a flight beside", "another table beside"],
+)
+def test_which_folders_are_one_recording(put, tmp_path, files, one_session):
+    folder = tmp_path / "flights"
+    folder.mkdir()
+    for name, text in files.items():
+        put(name, text, "flights")
+    assert recognises_folder(folder) is one_session
 
 
 def test_a_header_in_mid_file_is_said(put):
@@ -267,29 +265,3 @@ def test_told_from_other_csv():
     assert recognises(as_cfclient(STATE, []).encode())
     for header in ("t,px,py", "Timestamp,", "Timestamp,x", "Timestamp,a b.c", "times,a.b", ""):
         assert not recognises(header.encode() + b"\n1,2\n")
-
-
-def test_real_rows_written_as_cfclient_would(shared_recordings, put):
-    """Blocks of the real firmware, as cfclient would have stored them: they come back as they were."""
-    blocks = {}
-    with gzip.open(shared_recordings / "real_firmware" / "lee_brushless_39g.csv.gz", "rt") as file:
-        for row in csv.DictReader(io.StringIO(file.read())):
-            if row["block"] != "ref":
-                rows = blocks.setdefault(row["block"], {})
-                rows.setdefault(int(row["fw_ms"]), {})[row["name"]] = float(row["value"])
-    for name, rows in blocks.items():
-        variables = tuple(next(iter(rows.values())))
-        whole = [(stamp, *values.values()) for stamp, values in rows.items() if tuple(values) == variables]
-        path = put(f"{name}-20260801T10-00-00.csv", as_cfclient(variables, whole))
-    recording = opened(path.parent)
-    assert {"position", "body_rate", "specific_force", "motor_command", "voltage"} <= recording.signals.keys()
-    assert recording.metadata["motor"]["meaning"] == "duty"
-    assert {array.stream for array in recording.signals.values()} == set(blocks)
-
-
-def test_motors_are_asked_about(put):
-    still = [(10 * i, 100, 100, 100, 100) for i in range(50)]
-    recording = opened(put("motor.csv", as_cfclient(MOTOR, still)))
-    (finding,) = about(recording, "motor_meaning")
-    assert finding.grade is Grade.DEGRADES
-    assert set(recording.signals) == set(motor_meaning.MOTOR_VARIABLES)

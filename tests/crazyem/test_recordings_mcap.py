@@ -2,7 +2,6 @@
 
 import math
 import time
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from crazyem.control.trajectories import Reference
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.estimation.result import Estimate, ParameterEstimate
 from crazyem.links.base import LinkStatistics, ParameterWrite
@@ -28,15 +28,6 @@ STATE = block(0, *(f"stateEstimate.{n}" for n in ("x", "y", "z")), *(f"stateEsti
 IMU = block(1, "gyro.x", "gyro.y", "gyro.z", "acc.x", "acc.y", "acc.z")
 WIDE = block(2, "pm.vbat", *(f"g.v{i}" for i in range(25)), ctype="uint8_t")  # field numbers beyond one-byte tags
 BLOCKS = (STATE, IMU, WIDE)
-
-
-@dataclass(frozen=True)
-class Reference:
-    position: tuple = (0.1, 0.2, 0.3)
-    velocity: tuple = (1.0, 2.0, 3.0)
-    acceleration: tuple = (0.0, -0.0, 5e-324)
-    yaw: float = 0.4
-    yaw_rate: float = 0.5
 
 
 def flight(count):
@@ -103,7 +94,7 @@ def record_everything(path, *, append=False):
         writer.blocks(BLOCKS)
         for packet in flight(200):
             writer.packet(packet)
-        writer.setpoint(1.25, Reference())
+        writer.setpoint(1.25, Reference((0.1, 0.2, 0.3), (1.0, 2.0, 3.0), (0.0, -0.0, 5e-324), yaw=0.4, yaw_rate=0.5))
         writer.parameter_write(ParameterWrite("ctrlLee.mass", 0.034, None, False, 1.7e9 + 1))
         writer.estimate(Estimate(2.5, parameters, samples=800, updates=7, converged=True))
         writer.residual(2.5, np.arange(12) / 8, np.full(12, 0.5))

@@ -1,10 +1,16 @@
 """Tables of firmware variables as signals: the best source wins, nothing is lost, what can be shared is shared."""
 
+import math
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from crazyem.recordings.recording import Recording
+from crazyem.recordings import Recording, SignalArray
+from crazyem.recordings.columns import rows_of
 from crazyem.recordings.tables import Table, signals_from_tables
+from crazyem.recordings.topics import MOST_RAW_SIGNALS, Mapped, Topic, ranks, signals_of
 from crazyem.signals.firmware_units import unit_of
 
 N = 6
@@ -119,3 +125,108 @@ def test_a_signalling_nan_of_damaged_bytes_is_a_nan_and_no_warning() -> None:
     signals = signals_from_tables([Table("t", columns, time, order)], motor=None)
     for value in (signals["specific_force"].value[:, 0], signals["other.name"].value[:, 0]):
         assert np.isfinite(value).tolist() == [True, False]
+
+
+# --- topics: names, orders and bounds hold whatever they are called ---
+
+
+def topic(name: str, rows: int, columns: tuple[str, ...], start: int = 0) -> Topic:
+    values = {c: np.arange(rows) + 100.0 * i for i, c in enumerate(columns)}
+    return Topic(name, values, np.arange(rows, dtype=float), np.arange(start, start + rows))
+
+
+def test_topics_of_one_name_stay_apart() -> None:
+    first, second = topic("a", 3, ("x", "y")), topic("a", 5, ("x",), 3)
+    voltage = [Mapped("voltage", t, t.columns["x"][:, None], ("x",)) for t in (first, second)]
+    signals, left_out = signals_of([first, second], voltage)
+    assert {n: s.value.shape for n, s in signals.items()} == {"voltage": (3, 1), "voltage@a": (5, 1), "a.y": (3, 1)}
+    assert not left_out
+    signals, _ = signals_of([first, second], [])
+    assert {n: s.time.size for n, s in signals.items()} == {"a.x": 3, "a.y": 3, "a.x'": 5}
+
+
+def test_orders_are_unique_and_follow_the_rows() -> None:
+    times = [np.array([0.0, 2.0, 4.0]), np.array([1.0, 2.0, 3.0])]
+    places = ranks(times)
+    assert [p.tolist() for p in places] == [[0, 2, 5], [1, 3, 4]]
+    topics = [Topic(n, {"x": t, "y": t}, t, p) for n, t, p in zip(("a", "b"), times, places, strict=True)]
+    signals, _ = signals_of(topics, [])
+    order = np.concatenate([s.order for s in signals.values()])
+    time = np.concatenate([s.time for s in signals.values()])
+    assert np.unique(order).size == order.size
+    assert (np.diff(time[np.argsort(order)]) >= 0).all()
+
+
+def test_too_many_columns_are_left_out_and_counted() -> None:
+    many = topic("many", 2, tuple(f"c{i}" for i in range(MOST_RAW_SIGNALS + 7)))
+    signals, left_out = signals_of([many], [])
+    assert len(signals) == MOST_RAW_SIGNALS
+    assert left_out[0].evidence["left_out"] == 7
+
+
+# --- rows of a table, some at a time: the same as by a plain loop over all samples in order ---
+
+
+STAMPS = st.sampled_from([0.0, -0.0, 0.01, math.nan])
+HOSTS = st.sampled_from([math.nan, 1.7e9])
+
+
+def signal(time: list[float], host: list[float], order: list[int]) -> SignalArray:
+    n = len(time)
+    return SignalArray(
+        np.array(time, float), np.zeros((n, 1)), np.array(order, np.int64), np.array(host, float), np.zeros(n, bool)
+    )
+
+
+@st.composite
+def recordings(draw: st.DrawFn) -> Recording:
+    """Few stamps and few orders, so that many samples share them; orders that go back."""
+    signals = {}
+    for name in "abcd"[: draw(st.integers(1, 4))]:
+        n = draw(st.integers(0, 12))
+        lists = [draw(st.lists(kind, min_size=n, max_size=n)) for kind in (STAMPS, HOSTS, st.integers(0, 9))]
+        order = sorted(lists[2]) if draw(st.booleans()) else lists[2]
+        signals[name] = signal(lists[0], lists[1], order)
+    return Recording("there", "made", signals)
+
+
+def plain(recording: Recording) -> list[tuple[str, str, list[tuple[str, int]]]]:
+    """[(stamp, host time, [(signal, sample)])] with a loop."""
+    names = list(recording.signals)
+    samples = [
+        (int(array.order[i]), place, i)
+        for place, array in enumerate(recording.signals.values())
+        for i in range(array.time.size)
+    ]
+    rows: list[tuple[str, str, list[tuple[str, int]]]] = []
+    last = -1
+    for _, place, i in sorted(samples):
+        array = recording.signals[names[place]]
+        stamps = (array.time[i].hex(), array.host_time[i].hex())
+        if not rows or stamps != rows[-1][:2] or place <= last:
+            rows.append((*stamps, []))
+        rows[-1][2].append((names[place], i))
+        last = place
+    return rows
+
+
+@given(recordings(), st.integers(1, 6))
+def test_rows_some_at_a_time_are_those_of_a_plain_loop(recording: Recording, count: int) -> None:
+    found: list[tuple[str, str, list[tuple[str, int]]]] = []
+    for rows in rows_of(recording, recording.signals, samples=count):
+        begin = len(found)
+        found += [(t.hex(), h.hex(), []) for t, h in zip(rows.time, rows.host_time, strict=True)]
+        for name in recording.signals:
+            for row, sample in zip(rows.row[name].tolist(), rows.sample[name].tolist(), strict=True):
+                found[begin + row][2].append((name, sample))
+    assert found == plain(recording)
+
+
+@pytest.mark.parametrize("order", [np.arange(1000), np.zeros(1000, int), np.arange(1000)[::-1]])
+def test_what_is_taken_at_once_is_bounded(order: np.ndarray) -> None:
+    one = signal(np.arange(1000.0).tolist(), [math.nan] * 1000, order.tolist())
+    parts = list(rows_of(Recording("there", "made", {"a": one}), ["a", "not there"], samples=10))
+    assert sum(rows.time.size for rows in parts) == 1000
+    if len(set(order.tolist())) > 1:  # samples of one order stay together
+        assert max(rows.time.size for rows in parts) <= 10
+    assert list(rows_of(Recording("there", "made", {}), ["a"])) == []

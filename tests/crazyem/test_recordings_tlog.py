@@ -12,8 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.generator.mavcrc import x25crc
+from recording_files import assert_cut_anywhere
 from scipy.spatial.transform import Rotation
 
+from crazyem.doctor import Grade, examine
 from crazyem.errors import CrazyemError, FileFormatError
 from crazyem.recordings.autopilots.tlog_file import read, recognises
 from crazyem.recordings.contents import ReadOptions
@@ -295,38 +297,23 @@ def test_the_same_numbers_as_pymavlink(tmp_path: Path, old: bool) -> None:
 
 
 def test_signed_frames_are_read(tmp_path: Path) -> None:
-    content = b""
-    link = mavlink.MAVLink(io.BytesIO(), 1, 1)
-    link.signing.secret_key = bytes(32)
-    link.signing.sign_outgoing = True
+    log = Log()
+    link = log.links[1, 1] = mavlink.MAVLink(io.BytesIO(), 1, 1)
+    link.signing.secret_key, link.signing.sign_outgoing = bytes(32), True
     for k in range(5):
-        frame = mavlink.MAVLink_attitude_message(1000 + k, 0.1 * k, 0, 0, 0, 0, 0).pack(link)
-        assert frame[2] == 1
-        content += struct.pack(">Q", START + k) + frame
-    recording = opened(tmp_path, content)
+        log.add(START + k, mavlink.MAVLink_attitude_message(1000 + k, 0.1 * k, 0, 0, 0, 0, 0))
+    assert log.bytes[10] == 1  # the flag that says so
+    recording = opened(tmp_path, log.bytes)
     np.testing.assert_array_equal(recording.signals["euler"].value[:, 0], single(0.1 * np.arange(5)))
     assert not [f for f in recording.findings if f.check == "integrity"]
 
 
 def test_truncation_at_any_byte(tmp_path: Path) -> None:
     content, _ = flight(rows=1)
-    whole = opened(tmp_path, content)
     ends = [0]
     while ends[-1] < len(content):
         ends.append(ends[-1] + 8 + content[ends[-1] + 9] + 12)
-    near = {end + d for end in ends for d in (-1, 0, 1)} & set(range(len(content)))
-    for size in sorted({*range(0, len(content), 5), *near}):
-        try:
-            part = opened(tmp_path, content[:size])
-        except FileFormatError:
-            assert size < ends[1]
-            continue
-        for name, signal in part.signals.items():
-            n, same = signal.time.size, next(s for s in whole.signals.values() if s.source == signal.source)
-            if name in whole.signals and whole.signals[name].quantity == signal.quantity == same.quantity:
-                np.testing.assert_array_equal(signal.value, same.value[:n])
-        cut = [f.evidence["offset"] for f in part.findings if f.check == "integrity"]
-        assert cut == ([] if size in ends else [max(e for e in ends if e <= size)])
+    assert_cut_anywhere(lambda part: opened(tmp_path, part), content, ends, first=ends[1])
 
 
 def test_garbage_between_frames_costs_only_itself(tmp_path: Path) -> None:
@@ -411,7 +398,9 @@ def test_a_battery_monitor_that_reads_zero_is_not_connected(tmp_path: Path) -> N
     recording = opened(tmp_path, log.bytes)
     assert "voltage" not in recording.signals
     assert "no battery monitor" in recording.metadata["not_measured"]["voltage"]
-    assert [f.signal for f in recording.findings if f.signal] == ["voltage"]
+    (about,) = [f for f in examine(recording) if f.signal == "voltage" or "voltage" in f.text]
+    assert about.grade is Grade.HARMLESS
+    assert "no battery monitor is connected" in about.text
 
 
 def test_an_autopilot_that_was_started_again_makes_two_parts_on_one_axis(tmp_path: Path) -> None:

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from recording_files import assert_cut_anywhere
 from scipy.spatial.transform import Rotation
 
+from crazyem.cli import main
 from crazyem.errors import FileFormatError
 from crazyem.recordings.autopilots.ulog_file import read, recognises
 from crazyem.recordings.contents import ReadOptions
@@ -265,28 +267,14 @@ def test_appended_data_is_read(tmp_path: Path) -> None:
 
 def test_truncation_at_any_byte(tmp_path: Path) -> None:
     content = header() + definitions("vehicle_attitude", "battery_status", "esc_status")
+    first = len(content + data("vehicle_attitude", 1000, 1, 0, 1, 0))
     for i in range(1, 5):
         content += data("vehicle_attitude", 1000 * i, 1, 0, i, 0) + data("battery_status", 1000 * i + 5, 4, i)
         content += data("esc_status", 1000 * i + 9, 4, *[i] * 24)
-    whole = opened(tmp_path, content)
     starts = [16]
     while starts[-1] < len(content):
         starts.append(starts[-1] + 3 + int.from_bytes(content[starts[-1] : starts[-1] + 2], "little"))
-    near = {start + d for start in starts for d in (-1, 0, 1)} & set(range(len(content)))
-    readable = 0
-    for size in sorted({*range(0, len(content), 5), *near}):
-        try:
-            part = opened(tmp_path, content[:size])
-        except FileFormatError:
-            continue
-        readable += 1
-        for name, signal in part.signals.items():
-            n = signal.time.size
-            np.testing.assert_array_equal(signal.value, whole.signals[name].value[:n])
-            np.testing.assert_array_equal(signal.time, whole.signals[name].time[:n])
-        cut = [f.evidence["offset"] for f in part.findings if f.check == "integrity"]
-        assert cut == ([] if size in starts else [max(start for start in starts if start <= size)])
-    assert readable > 140  # from the first data message on
+    assert_cut_anywhere(lambda part: opened(tmp_path, part), content, starts, first=first)
 
 
 def test_garbage_in_the_middle_costs_only_itself(tmp_path: Path) -> None:
@@ -397,3 +385,11 @@ def test_a_topic_without_any_stamps_says_so(tmp_path: Path) -> None:
     assert "voltage" not in recording.signals
     (finding,) = [f for f in recording.findings if f.check == "stamps"]
     assert "battery_status has no stamps" in finding.text
+
+
+def test_what_was_read_without_wild_stamps_is_written_without_them(tmp_path: Path) -> None:
+    path, fixed = save(tmp_path, with_stamps(as_stamped, {20: 10**15})), tmp_path / "fixed.mcap"
+    assert main(["doctor", str(path), "--fix", "-o", str(fixed)]) == 0
+    again = open_recording(fixed)
+    np.testing.assert_array_equal(again.signals["body_rate"].time, open_recording(path).signals["body_rate"].time)
+    assert not [f for f in again.findings if f.check == "stamps"]

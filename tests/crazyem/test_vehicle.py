@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from crazyem.errors import FileFormatError, UsageError
+from crazyem.errors import FileFormatError
 from crazyem.estimation.model import SPREAD, setup_for
 from crazyem.vehicle import Days, Vehicle, load_vehicle, parse_vehicle, preset_names
 
@@ -192,8 +192,3 @@ def test_the_file_the_others_are_made_from_is_good():
 def test_any_text_is_a_vehicle_or_a_user_error(source):
     with contextlib.suppress(FileFormatError):
         parse_vehicle(source)
-
-
-def test_a_name_that_is_no_preset():
-    with pytest.raises(UsageError, match=r"unknown vehicle 'cf3'.*cf2, .*cf2-legacy"):
-        load_vehicle("cf3")

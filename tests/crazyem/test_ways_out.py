@@ -136,7 +136,7 @@ def test_a_swarm_writes_in_the_air_only_and_begins_no_set_once_it_is_left(monkey
             if way == "second Ctrl-C":
                 everyone[0]()
         elif way == "estimator fails":
-            session.pipeline.estimator.inner.error = ValueError("boom")
+            session.pipeline.estimator.inner.fail_at = 0
         elif way == "link lost":
             link.lost_at = link.fm
 

@@ -66,32 +66,25 @@ def test_arming_is_refused_before_the_checks_have_passed():
     assert not Bench(auto_arm=False).supervisor.request_arming(True)
 
 
-def test_stale_setpoints_level_out_then_lock_for_good():
+def test_a_fresh_setpoint_saves_a_drone_that_levels_out_and_none_a_locked_one():
+    """What levelling out is: test_like_the_real_one.py."""
     bench = Bench()
     bench.fly()
     bench.stamp = bench.tick
-    assert bench.run(480) == State.FLYING
-    assert bench.run(80) == State.LEVEL_OUT
-    setpoint = sp.null_setpoint()
-    setpoint[[sp.MODE_X, sp.MODE_Y, sp.MODE_Z]] = sp.ABSOLUTE
-    setpoint[sp.Z], setpoint[sp.ROLL] = 1.0, 20.0
-    level = bench.supervisor.override(setpoint)
-    assert (level[sp.MODE_X], level[sp.MODE_ROLL], level[sp.MODE_YAW]) == (sp.DISABLE, sp.ABSOLUTE, sp.VELOCITY)
-    assert (level[sp.ROLL], level[sp.MODE_Z], level[sp.Z]) == (0.0, sp.ABSOLUTE, 1.0)
+    assert bench.run(560) == State.LEVEL_OUT
     bench.stamp = bench.tick
-    assert bench.run(40) == State.FLYING  # a fresh setpoint saves it
+    assert bench.run(40) == State.FLYING
     bench.stamp = bench.tick
     assert bench.run(2200) == State.LOCKED
-    assert not bench.supervisor.motors_allowed
-    np.testing.assert_array_equal(bench.supervisor.override(setpoint), sp.null_setpoint())
+    np.testing.assert_array_equal(bench.supervisor.override(sp.null_setpoint() + 1.0), sp.null_setpoint())
     bench.stamp = None
     assert bench.run(5000) == State.LOCKED
-    assert bench.supervisor.info & 0x40
     assert bench.console == ["SUP: Locked, reboot required\n"]
 
 
 @pytest.mark.parametrize(("z", "soon", "late"), [(0.4, 900, 1300), (-0.5, 80, 300)])
-def test_a_tumble_is_a_crash_and_needs_recovery(z, soon, late):
+def test_a_tumble_is_a_crash_after_its_time(z, soon, late):
+    """The recovery from it: test_like_the_real_one.py."""
     bench = Bench()
     bench.fly()
     bench.set("acc.z", z)
@@ -99,14 +92,6 @@ def test_a_tumble_is_a_crash_and_needs_recovery(z, soon, late):
     assert bench.run(soon) == State.FLYING
     assert bench.run(late) == State.CRASHED
     assert bench.supervisor.info & 0xA0 == 0xA0  # tumbled and crashed
-    assert not bench.supervisor.request_recovery()  # still on its back
-    bench.set("acc.z", 1.0)
-    bench.set("motor.m1", 0.0)
-    assert bench.run(1000) == State.CRASHED
-    assert bench.supervisor.request_recovery()
-    bench.run(2500)
-    assert bench.supervisor.can_fly
-    assert not bench.supervisor.crashed
 
 
 def test_free_fall_is_no_tumble():

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from second_look import usd_table
 
 from firmware_sim import wire
 from firmware_sim.controllers import parameters
@@ -23,35 +24,6 @@ PAD = [f"controller__normal_flight__E{n}_log00" for n in (8, 9)]
 NAMES = ["stateEstimate.x", "stateEstimate.z", "controller.cmd_thrust"]
 NAMES += [f"controller.{n}" for a in ("roll", "pitch", "yaw") for n in (f"cmd_{a}", f"r_{a}", f"{a}Rate")]
 STEP = 0.01  # s
-
-
-def read_usd(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a uSD log's fixed-frequency event (version 2), without its checksum."""
-    data, offset = path.read_bytes(), 5
-    events: dict[int, list[str]] = {}
-
-    def text() -> str:
-        nonlocal offset
-        end = data.index(b"\0", offset)
-        word, offset = data[offset:end].decode(), end + 1
-        return word
-
-    for _ in range(struct.unpack_from("<H", data, 3)[0]):
-        number = struct.unpack_from("<H", data, offset)[0]
-        offset += 2
-        text()
-        count = struct.unpack_from("<H", data, offset)[0]
-        offset += 2
-        events[number] = [text() for _ in range(count)]
-    rows = []
-    while offset < len(data) - 4:
-        number = struct.unpack_from("<H", data, offset)[0]
-        form = "<Q" + "".join(name[name.index("(") + 1] for name in events[number])
-        if number == 0xFFFF:
-            rows.append(struct.unpack_from(form, data, offset + 2))
-        offset += 2 + struct.calcsize(form)
-    columns = np.array(rows, dtype=float).T[1:]
-    return {name.partition("(")[0]: column for name, column in zip(events[0xFFFF], columns, strict=True)}
 
 
 def stretches(log: dict[str, np.ndarray]) -> list[slice]:
@@ -73,7 +45,7 @@ def rate_law(log: dict[str, np.ndarray], axis: str, part: slice) -> tuple[np.nda
 
 @pytest.fixture(scope="module")
 def real() -> list[dict[str, np.ndarray]]:
-    return [read_usd(FOLDER / name) for name in PAD]
+    return [{name: column.to_numpy() for name, column in usd_table(FOLDER / pad).items()} for pad in PAD]
 
 
 @pytest.fixture(scope="module")

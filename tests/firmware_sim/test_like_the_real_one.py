@@ -45,14 +45,11 @@ class Drone:
         return [p.data for p in packets if (p.port, p.channel) == (port, channel)]
 
     def run(self, seconds, stream=None, every=0.02):
-        """Let time pass, sending the packet stream(t) every so often; the named log variables of each step."""
-        for n in range(round(seconds / every)):
-            if stream is not None:
-                self.ask(wire.SETPOINT_GENERIC, 0, stream(n * every))
-            self.firmware.advance(round(every * 1000))
+        """Let time pass, sending the packet stream(t) every so often."""
+        self.watch(seconds, (), stream, every)
 
     def watch(self, seconds, names, stream=None, every=0.01):
-        """Like run; returns the values of the named log variables after each step."""
+        """The same; the values of the named log variables after each step."""
         seen = []
         for n in range(round(seconds / every)):
             if stream is not None:

@@ -1,14 +1,13 @@
 """The fault relay with plain sockets: what is sent on one side against what arrives on the other, and its schedules."""
 
-import contextlib
 import json
 import re
 import signal
 import socket
-import threading
 import time
 
 import pytest
+from fake_peer import FakePeer
 from hypothesis import given
 from hypothesis import strategies as st
 from processes import running
@@ -183,35 +182,11 @@ def test_kinds_are_told_by_port_and_channel():
 # --- sockets --------------------------------------------------------------------------------------------------------
 
 
-class Drone:
-    """Answers every datagram with itself, in a thread."""
-
-    def __init__(self):
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.bind(("127.0.0.1", 0))
-        self.uri = "udp://{}:{}".format(*self.socket.getsockname())
-        self.heard = []
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def _run(self):
-        with contextlib.suppress(OSError):
-            while True:
-                datagram, sender = self.socket.recvfrom(2048)
-                if datagram == b"end":
-                    return
-                self.heard.append((datagram, sender))
-                self.socket.sendto(datagram, sender)
-
-    def close(self):
-        self.socket.sendto(b"end", self.socket.getsockname())
-        self._thread.join(5)
-        self.socket.close()
-
-
 @pytest.fixture
 def drone():
-    peer = Drone()
+    """Answers every datagram with itself."""
+    peer = FakePeer()
+    peer._answer = lambda datagram: [datagram]
     yield peer
     peer.close()
 
@@ -231,7 +206,7 @@ def test_packets_pass_both_ways_and_hosts_are_kept_apart(drone):
             other.send(b"\x2f" + bytes([n]))
             assert one.recv(64) == b"\x2e" + bytes([n])
             assert other.recv(64) == b"\x2f" + bytes([n])
-        assert len({sender for _, sender in drone.heard}) == 2
+        assert len(relay._drones) == 2
 
 
 def test_a_dead_peer_refuses_and_comes_back(drone):

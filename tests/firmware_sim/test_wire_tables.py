@@ -1,5 +1,6 @@
 """CRTP packets and the tables: bytes as the real firmware and cflib put them on the wire."""
 
+import itertools
 import json
 import struct
 import zlib
@@ -14,6 +15,7 @@ from firmware_sim import contents, tables, wire
 from firmware_sim.firmware import Firmware
 from firmware_sim.flight import Flight
 from firmware_sim.scenario import load_scenario
+from firmware_sim.wire import Air
 
 
 @given(st.integers(0, 15), st.integers(0, 3), st.binary(max_size=30))
@@ -170,3 +172,25 @@ def test_checksums_tell_tables_apart():
     assert one.crc == zlib.crc32(b"log\x07a\0b\0\x07a\0c\0")
     with pytest.raises(ValueError, match="too long"):
         tables.log_table(slots("averylonggroup.averylongname"))
+
+
+# --- packet loss: the share and the length of bursts are what the scenario says ---
+
+
+@pytest.mark.parametrize(("loss", "burst"), [(0.1, 4.0), (0.02, 1.0), (0.5, 10.0), (0.9, 3.0)])
+def test_share_and_bursts(loss, burst):
+    air = Air(loss, burst, seed=1)
+    lost = [air.loses() for _ in range(200_000)]
+    # sd of the share: the chain's correlation time is about `burst` packets
+    sd = (loss * (1 - loss) * 2 * max(burst, 1 / (1 - loss)) / len(lost)) ** 0.5
+    assert abs(sum(lost) / len(lost) - loss) < 5 * sd
+    lengths = [len(list(group)) for bad, group in itertools.groupby(lost) if bad]
+    mean = sum(lengths) / len(lengths)
+    # with entering certain, bursts are as long as the loss demands
+    assert mean == pytest.approx(max(burst, loss / (1 - loss)), rel=0.05)
+
+
+def test_nothing_is_lost_by_default_and_seeds_repeat():
+    assert not any(Air(0.0, 5.0, seed=3).loses() for _ in range(1000))
+    one, other = Air(0.3, 2.0, seed=9), Air(0.3, 2.0, seed=9)
+    assert [one.loses() for _ in range(1000)] == [other.loses() for _ in range(1000)]
