@@ -144,7 +144,7 @@ def test_what_is_known_at_a_start() -> None:
     state = np.concatenate([place, turned.apply(along), turned.as_quat(), rate], axis=1)
     gained = np.array([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [9.0, 9.0, 9.0], [0.0, 0.0, 0.0]])
     shown = SimpleNamespace(state=state, time=np.array([0.0, 0.01, 0.03, 0.04]), period=0.01)
-    start = _at_start(shown, gained, np.array([True, True, False, False]))  # type: ignore[arg-type]
+    start = _at_start(shown, gained, np.array([True, True, False, False]))
     assert start[:, :, 0] == pytest.approx(  # in the step that ends there, of those that count
         np.array([[0, 0, 0], [0, 20, 30], [0, 10, 0], [0, 0, 0]], float), abs=1e-9
     )
