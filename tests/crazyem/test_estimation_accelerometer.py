@@ -125,21 +125,3 @@ def test_missing_readings_breaks_and_unusable_steps_never_spread(holes, special,
     counted = ~np.isnan(tape.force)
     counted[[0, special]] = False
     assert tape.stats[:, kernels.MEASURED + ACCELEROMETER].sum() == counted.sum()
-
-
-def test_simulated_readings_are_consistent_with_the_filter():
-    """A drone stepped by the model with noise: innovations of state and accelerometer have the variance expected.
-
-    And the noise that the smoother finds in the accelerometer is the noise that was put in.
-    """
-    n = 600
-    tape = plain.simulated(np.random.default_rng(8), n, lead=0.0, dt=0.01)
-    with_readings = plain.forward(tape, lead=0.0)
-    plain.backward(tape, lead=0.0)
-    mean_square = np.mean(tape.e[1:] ** 2 / tape.s[1:])
-    assert mean_square == pytest.approx(1.0, abs=4 * np.sqrt(2 / (12 * n)))
-    found = tape.stats[:, kernels.RESIDUAL + ACCELEROMETER].sum() / (3 * (n - 1))
-    resolved = tape.stats[:, kernels.RESIDUAL_SEEN + ACCELEROMETER].sum()
-    assert found / R_FORCE == pytest.approx(1.0, abs=4 * np.sqrt(2 / resolved))
-    tape.force[:] *= 1.2  # readings of a wrong scale are less likely
-    assert plain.forward(tape, lead=0.0) < with_readings - 100

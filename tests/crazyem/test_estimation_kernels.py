@@ -7,7 +7,6 @@ import synthetic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rigid_body import State, step, step_jacobians
-from scipy.spatial.transform import Rotation
 
 from crazyem.estimation import kernels
 from crazyem.estimation.tape import BREAK, START_VARIANCE, Tape
@@ -347,24 +346,3 @@ def test_attitude_sign_of_a_logged_quaternion_does_not_matter():
     other.xp[0, 6:10] = tape.xp[0, 6:10]
     assert forward(tape) == pytest.approx(forward(other), rel=1e-12)
     np.testing.assert_allclose(tape.xf, other.xf, atol=1e-12)
-
-
-def test_filter_is_the_same_in_a_turned_world():
-    """Yawing and shifting the world leaves mass, inertia, likelihood and statistics where they are."""
-    tape, other = filled_tape(8), filled_tape(8)
-    yaw = Rotation.from_euler("z", 0.7)
-    for array in (other.y, other.xp):
-        rows = slice(None) if array is other.y else slice(0, 1)
-        for columns in (slice(0, 3), slice(3, 6)):
-            array[rows, columns] = np.where(
-                np.isnan(array[rows, columns]), np.nan, array[rows, columns] @ yaw.as_matrix().T
-            )
-        for k in range(len(array[rows])):
-            if not np.isnan(array[k, 6]):
-                array[k, 6:10] = (yaw * Rotation.from_quat(array[k, 6:10])).as_quat()
-    assert forward(tape) == pytest.approx(forward(other), rel=1e-9)
-    backward(tape)
-    backward(other)
-    scale = np.abs(tape.stats).max(0) + 1e-300
-    exact = slice(0, kernels.RESIDUAL_SEEN)  # what follows is taken scalar by scalar, and depends on the axes a little
-    np.testing.assert_allclose((tape.stats / scale)[:, exact], (other.stats / scale)[:, exact], atol=1e-6)
