@@ -1,12 +1,10 @@
 """Where a flight and a model part, in axes of the body and of the world; a heading that depends on place."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from closed_loop import Hidden, fly
 from diagnosis_parts import data_of, start_point
-from made_flight import array_of
+from made_flight import changed, without
 from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.fitting.fit import nominal
@@ -41,10 +39,8 @@ def test_nothing_and_a_weak_rotor_belong_to_no_axis_of_the_world() -> None:
 # -- a heading that depends on place -----------------------------------------------------------------------------------
 
 
-def with_attitude(recording: Recording, attitude: Rotation) -> Recording:
-    signal = recording.signals["attitude"]
-    changed = array_of("attitude", signal.time, attitude.as_quat(), place=96)
-    return replace(recording, signals={**recording.signals, "attitude": changed})
+def with_attitude(recording, attitude):
+    return changed(recording, "attitude", value=attitude.as_quat())
 
 
 def magnetic(recording: Recording, size: float) -> Recording:
@@ -68,11 +64,9 @@ def test_a_heading_that_goes_with_x_is_found_with_its_size(flights) -> None:
     assert heading_by_place(one, None) is not None
 
 
-def hovering(recording: Recording, share: float = 0.01) -> Recording:
+def hovering(recording, share=0.01):
     """As if it had gone no more than this share of its way."""
-    place = recording.signals["position"]
-    near = array_of("position", place.time, share * place.value + [0.1, 0.2, 1.0], place=97)
-    return replace(recording, signals={**recording.signals, "position": near})
+    return changed(recording, "position", value=share * recording.signals["position"].value + [0.1, 0.2, 1.0])
 
 
 def test_it_is_found_on_a_flight_held_out_where_the_one_fitted_hovers(flights) -> None:
@@ -97,29 +91,20 @@ def test_what_is_not_so_on_the_other_flight_is_not_named(flights) -> None:
 def test_nothing_is_found_where_sensors_are_biased_tilted_scaled_or_late(flights) -> None:
     tilt = Rotation.from_euler("xyz", [0.05, -0.04, 0.1])
     for change in ("none", "tilt", "bias", "scale", "late"):
-        changed = []
+        wrong = []
         for flight in flights:
             f, rate = flight, flight.signals["body_rate"]
             if change == "tilt":
                 f = with_attitude(f, Rotation.from_quat(f.signals["attitude"].value) * tilt)
             values = {"bias": rate.value + np.array([0.02, -0.03, 0.05]), "scale": 1.03 * rate.value,
                       "late": np.roll(rate.value, 1, axis=0)}.get(change)  # fmt: skip
-            if values is not None:
-                shown = array_of("body_rate", rate.time, values, place=97)
-                f = replace(f, signals={**f.signals, "body_rate": shown})
-            changed.append(data_of(f))
-        assert heading_by_place(*changed) is None, change
+            wrong.append(data_of(f if values is None else changed(f, "body_rate", value=values)))
+        assert heading_by_place(*wrong) is None, change
 
 
-def test_without_position_attitude_or_gyro_nothing_is_said(flights) -> None:
+def test_without_position_or_attitude_and_where_the_drone_does_not_move_nothing_is_said(flights):
     for name in ("position", "attitude"):
-        signals = {n: a for n, a in flights[0].signals.items() if n != name}
-        assert heading_by_place(data_of(replace(flights[0], signals=signals)), None) is None
-
-
-def test_where_the_drone_does_not_move_nothing_is_said(flights) -> None:
-    still = flights[0].signals["position"]
-    there = array_of("position", still.time, np.tile([0.1, 0.2, 1.0], (still.time.size, 1)), place=98)
-    held = data_of(replace(flights[0], signals={**flights[0].signals, "position": there}))
+        assert heading_by_place(data_of(without(flights[0], name)), None) is None
+    held = data_of(hovering(flights[0], share=0.0))
     assert heading_by_place(held, None) is None
     assert heading_by_place(held, held) is None
