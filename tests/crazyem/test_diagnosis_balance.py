@@ -1,4 +1,4 @@
-"""What a drone needs to hover against what days differ by: a weak rotor, a load and a wind, by one flight and by several."""
+"""What a drone needs to hover against what days differ by: a weak rotor, a load, a wind, by one flight and several."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""What is never exactly known: priors that depend on the flight, its sampling and the model; what intervals have added."""
+"""What is never exactly known: priors by the flight, its sampling and the model, and what intervals have added."""
 
 from dataclasses import replace
 from types import SimpleNamespace

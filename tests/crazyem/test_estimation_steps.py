@@ -1,4 +1,4 @@
-"""Payloads attached and released in flight are found and told from gusts; attitudes of an onboard filter, now and then."""
+"""Payloads attached and released in flight are found, and told from gusts; attitudes of an onboard filter."""
 
 import math
 from dataclasses import replace
