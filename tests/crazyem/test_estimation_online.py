@@ -86,26 +86,23 @@ def test_noise_scales_are_found_too(plain):
     assert [noise["torque_x"], noise["torque_y"]] == pytest.approx([TRUTH.torque_noise] * 2, rel=0.5)
 
 
-def test_the_same_samples_give_the_same_numbers(flight, plain):
-    assert begins(plain, feed(OnlineEstimator(LAGGED), synthetic.samples(flight)[:1500]))
+def shuffled(samples):
+    keys = np.random.default_rng(0).uniform(size=len(samples))
+    return [s for _, s in sorted(enumerate(samples), key=lambda e: (e[1].time, keys[e[0]]))]
 
 
-def test_the_order_of_samples_of_one_instant_does_not_matter(flight, plain):
-    samples = synthetic.samples(flight)[:1500]
-    rng = np.random.default_rng(0)
-    keys = rng.uniform(size=len(samples))
-    shuffled = [s for _, s in sorted(enumerate(samples), key=lambda e: (e[1].time, keys[e[0]]))]
-    assert shuffled != samples
-    assert begins(plain, feed(OnlineEstimator(LAGGED), shuffled))
+def with_more(samples):
+    unknown = {"specific_force": (0.0, 0.0, 9.81), "setpoint_position": (math.nan,) * 3}
+    return [one for s in samples for one in (s, s, *(Sample(name, s.time, v) for name, v in unknown.items()))]
 
 
-def test_signals_it_does_not_know_and_duplicates_change_nothing(flight, plain):
-    samples = synthetic.samples(flight)[:1500]
-    noisy = []
-    for sample in samples:
-        noisy += [sample, sample, Sample("specific_force", sample.time, (0.0, 0.0, 9.81)),
-                  Sample("setpoint_position", sample.time, (math.nan,) * 3)]  # fmt: skip
-    assert begins(plain, feed(OnlineEstimator(LAGGED), noisy))
+@pytest.mark.parametrize(
+    "change",
+    [list, shuffled, with_more],
+    ids=["the same samples", "another order of one instant", "duplicates and signals that it does not know"],
+)
+def test_the_same_numbers_come_of(flight, plain, change):
+    assert begins(plain, feed(OnlineEstimator(LAGGED), change(synthetic.samples(flight)[:1500])))
 
 
 def test_late_samples_are_counted_and_not_used(flight, plain):
