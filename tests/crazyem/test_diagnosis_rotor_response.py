@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from closed_loop import DRONE, fly
-from made_flight import array_of
+from made_flight import array_of, changed
 from scipy.special import expit
 
 from crazyem.diagnosis import diagnose as diagnosing
@@ -113,11 +113,9 @@ def test_what_does_not_answer_says_nothing(flown):
     made = answering(flown, 0.03, 0.0)
     assert response(answers([made], DRONE)) is None  # no rotor constant
     other = answering(flown, 0.03, 0.0, seed=1)
-    strange = replace(made, signals={**made.signals, "rotor_speed": other.signals["rotor_speed"]})
-    assert response(answers([strange], ROTORS)) is None
-    held = made.signals["rotor_speed"]
-    stuck = array_of("rotor_speed", held.time, np.full_like(held.value, 2000.0), place=90)
-    assert response(answers([replace(made, signals={**made.signals, "rotor_speed": stuck})], ROTORS)) is None
+    strange = other.signals["rotor_speed"].value
+    for speed in (strange, np.full_like(strange, 2000.0)):  # of another flight, and stuck
+        assert response(answers([changed(made, "rotor_speed", value=speed)], ROTORS)) is None
 
 
 def found(lag, delay, sd=1.4e-3):
@@ -166,13 +164,12 @@ def test_where_one_is_as_good_as_the_other_both_are_said():
 
 def test_wild_and_slow_samples_are_refused(flown):
     made = answering(flown, 0.03, 0.0)
-    speed, command = made.signals["rotor_speed"], made.signals["motor_command"]
-    wild = array_of("rotor_speed", speed.time, np.where(np.arange(speed.time.size)[:, None] % 50, speed.value, 1e300),
-                    place=91)  # fmt: skip
-    sound = response(answers([replace(made, signals={**made.signals, "rotor_speed": wild})], ROTORS))
+    speed, command = made.signals["rotor_speed"].value, made.signals["motor_command"]
+    wild = np.where(np.arange(len(speed))[:, None] % 50, speed, 1e300)
+    sound = response(answers([changed(made, "rotor_speed", value=wild)], ROTORS))
     assert sound.lag == pytest.approx(0.03, rel=0.06)
-    slow = array_of("motor_command", 300.0 * command.time, command.value, place=92)
-    assert response(answers([replace(made, signals={**made.signals, "motor_command": slow})], ROTORS)) is None
+    slow = changed(made, "motor_command", time=300.0 * command.time)
+    assert response(answers([slow], ROTORS)) is None
 
 
 @pytest.mark.parametrize("rotor", [1, 4])

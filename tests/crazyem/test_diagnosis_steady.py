@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 from diagnosis_parts import LAG, LOAD, ZERO_TRIM, rotor, silent
+from made_flight import changed
 
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fitting import sweeps
@@ -27,7 +28,6 @@ from crazyem.diagnosis.naming.steady import steady_rivals, with_exact_torques, w
 from crazyem.diagnosis.naming.trials import Selection, Trial, preferred
 from crazyem.diagnosis.settings import WIND
 from crazyem.diagnosis.workers import Workers
-from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
 NOISE = Noise(np.full(6, 0.3), np.full(4, 1e-2))
@@ -40,13 +40,11 @@ def point_of(vehicle: Vehicle, **effects: dict[str, Any]) -> Point:
     return Point(vehicle, {**{n: dict(v) for n, v in vehicle.effects.items()}, **effects}, NOISE)
 
 
-def shaking(recording: Recording, *, seed: int) -> Recording:
+def shaking(recording, *, seed):
     """With commands that were logged between others that acted: white, a tenth of the command, with no effect."""
-    logged = recording.signals["motor_command"]
-    noise = 0.1 * np.nanmean(logged.value) * np.random.default_rng(seed).standard_normal(logged.value.shape)
-    return replace(
-        recording, signals={**recording.signals, "motor_command": replace(logged, value=logged.value + noise)}
-    )
+    logged = recording.signals["motor_command"].value
+    noise = 0.1 * np.nanmean(logged) * np.random.default_rng(seed).standard_normal(logged.shape)
+    return changed(recording, "motor_command", value=logged + noise)
 
 
 def trial(candidate: Candidate, value: float, scatter: float = 0.1) -> Trial:
@@ -93,11 +91,9 @@ def test_a_drone_whose_commands_shake_has_a_trim_first() -> None:
 def test_an_offset_of_the_gyro_is_found_where_commands_shake() -> None:
     """No command is needed to see that attitude and gyro part."""
     shaken = shaking(fly(seconds=10.0, seed=8), seed=1)
-    gyro = shaken.signals["body_rate"]
     offset = {"x": 0.03, "y": 0.0, "z": -0.02}
-    shown = replace(gyro, value=gyro.value + np.array([*offset.values()]))
-    trimmed = replace(DRONE, effects={TRIM: dict.fromkeys("xyz", 0.0)})
-    found = diagnose([replace(shaken, signals={**shaken.signals, "body_rate": shown})], trimmed)
+    gyro = shaken.signals["body_rate"].value + np.array([*offset.values()])
+    found = diagnose([changed(shaken, "body_rate", value=gyro)], ZERO_TRIM)
     assert [e.name for e in found.effects] == ["gyro_bias"]
     for axis, value in found.effects[0].parameters.items():
         assert value.ci95[0] < offset[axis] < value.ci95[1]
