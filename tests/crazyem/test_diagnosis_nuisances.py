@@ -38,14 +38,14 @@ class Made(SimpleNamespace):
     __hash__ = object.__hash__
 
 
-def made(thrust, period=0.01, *, speed=0.0, measured=False, levelled=False):
+def made(thrust, period=0.01, *, speed=None, measured=False, levelled=False):
     """A flight as data: commands of (n, 4) thrusts [N] every `period` s; rms speeds [m/s] along x, y, z of 1, 2 and 4
-    times `speed`."""
+    times `speed`, or no velocities."""
     n = len(thrust)
     y, time = np.zeros((n, 13)), period * np.arange(n)
-    y[:, 3:6] = np.sqrt(2) * speed * np.array([1, 2, 4]) * np.sin(np.arange(n) * np.pi / 20)[:, None]
+    y[:, 3:6] = np.sqrt(2) * (speed or 0.0) * np.array([1, 2, 4]) * np.sin(np.arange(n) * np.pi / 20)[:, None]
     inputs = SimpleNamespace(measured=measured, time=time, thrust=thrust)
-    signals = frozenset({"position", "velocity", "attitude", "body_rate"})
+    signals = frozenset({"position", "attitude", "body_rate"} | ({"velocity"} if speed is not None else set()))
     flight = Made(
         name="flight", y=y, time=time, inputs=inputs, signals=signals, coarse=False, levelled=levelled, fused=False,
         differs=False,
@@ -67,6 +67,7 @@ def test_velocities_are_as_wrong_as_an_onboard_estimate_jitters():
     still = sds(flown(speed=0.0))["velocity_scale"]
     assert np.all(np.isfinite(still))
     assert np.all(still > 0.2)
+    assert not {"velocity_scale", "center_of_mass"} & sds(made(np.full((400, 4), 0.07))).keys()  # without velocities
 
 
 def test_a_biased_gyro_tilts_the_attitude_that_a_filter_makes_of_it():
