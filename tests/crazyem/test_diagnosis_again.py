@@ -8,15 +8,13 @@ from dataclasses import replace
 
 import pytest
 from closed_loop import DRONE, Hidden, fly
+from diagnosis_parts import DRAG, THRUST, ZERO_TRIM, nominal_of, start_point
 
 from crazyem.diagnosis import diagnose as diagnosing
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
-from crazyem.diagnosis.fitting.fit import Data, DivergedError, nominal
-from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import start_noise
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.fit import DivergedError
 from crazyem.diagnosis.fitting.nuisances import COARSE_REASON, refine_base
-from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.locating.random_torques import AT_RANDOM
 from crazyem.diagnosis.naming import answer, onset, trials
@@ -26,10 +24,6 @@ from crazyem.diagnosis.naming.trials import Selection
 from crazyem.diagnosis.naming.unexplained import Unexplained, notable
 from crazyem.diagnosis.settings import CONFIDENCE
 from crazyem.physics.effects import mass_properties
-
-DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
-THRUST = Candidate("thrust_scale", (), ("scale",))
-TRIMMED = replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}})
 
 
 @pytest.fixture(scope="module")
@@ -59,10 +53,8 @@ def test_an_inertia_that_no_body_has_leaves_open_what_turns_the_drone(slow_to_tu
 @pytest.mark.parametrize("diverges", [False, True])
 def test_an_effect_without_a_sound_fit_is_left_out_and_the_selection_goes_on(monkeypatch, diverges):
     """In the fit with all nuisances, a thrust scale is at the end of its range, or the filter leaves the numbers."""
-    data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02), thrust=(0.9,) * 4), seconds=10.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, start_noise()))
+    data, point = nominal_of(fly(Hidden(drag=(0.02, 0.02, 0.02), thrust=(0.9,) * 4), seconds=10.0))
     real, said = onset.refine_with_memory, []
-    end = THRUST.range_of("scale")[0]
 
     def unsound(data, point, accepted, **more):
         fit = real(data, point, accepted, **more)
@@ -70,7 +62,7 @@ def test_an_effect_without_a_sound_fit_is_left_out_and_the_selection_goes_on(mon
             return fit
         if diverges:
             raise DivergedError("the filter leaves the range of numbers")
-        return replace(fit, point=fit.point.with_effects({"thrust_scale": {"scale": end}}))
+        return replace(fit, point=fit.point.with_effects({"thrust_scale": {"scale": THRUST.range_of("scale")[0]}}))
 
     monkeypatch.setattr(onset, "refine_with_memory", unsound)
     found = select(data, point, [THRUST, DRAG], say=said.append)
@@ -104,7 +96,7 @@ def test_after_an_exchange_the_selection_goes_on(slow_to_turn, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("vehicle", "alike"), [(DRONE, False), (TRIMMED, True)])
+@pytest.mark.parametrize(("vehicle", "alike"), [(DRONE, False), (ZERO_TRIM, True)])
 def test_with_a_trim_a_load_is_told_with_two_weak_rotors(vehicle, alike):
     """A tenth less thrust of the left rotors; a load there explains it, where nothing else is asked."""
     flown = fly(Hidden(thrust=(1.0, 1.0, 0.85, 0.85)), seconds=10.0)
@@ -114,19 +106,20 @@ def test_with_a_trim_a_load_is_told_with_two_weak_rotors(vehicle, alike):
     assert any({"payload", "rotor_fault"} <= set(group) for group in found.indistinguishable) == alike
 
 
-def test_from_day_to_day_forces_differ_by_more():
-    point = Point(DRONE, {}, start_noise())
-    weight = 9.81 * DRONE.mass
-    for share, vehicle, counts in ((0.015, DRONE, True), (0.015, TRIMMED, False), (0.025, TRIMMED, True)):
-        force = Finding("force", "x", "always", "", (0.0, 9.0), share * weight, 1e-4, "N", 60.0, 1e-9)
-        assert notable(force, replace(point, vehicle=vehicle)) == counts
-        assert notable(force, replace(point, vehicle=vehicle), differ=True) == (share > 0.02)
+@pytest.mark.parametrize(
+    ("share", "vehicle", "counts"), [(0.015, DRONE, True), (0.015, ZERO_TRIM, False), (0.025, ZERO_TRIM, True)]
+)
+def test_from_day_to_day_forces_differ_by_more(share, vehicle, counts):
+    force = Finding("force", "x", "always", "", (0.0, 9.0), share * 9.81 * DRONE.mass, 1e-4, "N", 60.0, 1e-9)
+    assert notable(force, start_point(vehicle)) == counts
+    assert notable(force, start_point(vehicle), differ=True) == (share > 0.02)
+
+
+def left(signal, nats, *, axis="x", regime="always", variable=""):
+    return Finding(signal, axis, regime, variable, (0.0, 9.0), 1.0, 0.1, "", nats, 1e-9)
 
 
 def test_where_torques_say_nothing_they_say_nothing_against_what_forces_tell():
-    def left(signal: str, nats: float) -> Finding:
-        return Finding(signal, "x", "always", "", (0.0, 9.0), 1.0, 0.1, "", nats, 1e-9)
-
     remains = Unexplained((left("torque", 300.0), left("body_rate", 90.0)), 900.0)
     assert confidence_factor(remains) == CONFIDENCE.doubtful
     assert confidence_factor(remains.of_forces()) == 1.0
@@ -135,22 +128,25 @@ def test_where_torques_say_nothing_they_say_nothing_against_what_forces_tell():
 
 def test_a_rotor_that_pushes_at_random_says_nothing_against_forces_that_last():
     """One real drone's fourth rotor does, beside a thrust that is a quarter too weak by 80 000 nats."""
-    rotor = Finding("torque", "x", "rotor 4 at random", AT_RANDOM, (0.0, 9.0), 1e-4, 1e-5, "N m", 60.0, 1e-9)
-    shaken = Finding("torque", "x", "frequency 5.2 Hz", "frequency", (0.0, 9.0), 1e-4, 1e-5, "N m", 60.0, 1e-9)
-    remains = Unexplained((rotor,), 900.0)
-    assert confidence_factor(remains) == CONFIDENCE.doubtful
-    assert confidence_factor(remains.without_random_rotor()) == 1.0
-    assert confidence_factor(remains.without_random_rotor(4)) == 1.0  # nor against its being weak
-    assert confidence_factor(remains.without_random_rotor(1)) == CONFIDENCE.doubtful
+    remains = Unexplained((left("torque", 60.0, regime="rotor 4 at random", variable=AT_RANDOM),), 900.0)
+    shaken = left("torque", 60.0, regime="frequency 5.2 Hz", variable="frequency")
     swinging = remains.with_finding(shaken)  # a loop that swings looks like a drag
-    assert confidence_factor(swinging.without_random_rotor()) == CONFIDENCE.doubtful
-    data = Data([flight_of(fly(seconds=8.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, start_noise()))
-    for name, rotor, against in (
-        ("linear_drag", 0, False), ("inertia_products", 0, True), ("rotor_fault", 4, False), ("rotor_fault", 1, True),
-    ):  # fmt: skip
-        free = {"inertia_products": "xy", "rotor_fault": "scale"}.get(name, "x")
-        candidate = Candidate(name, (("rotor", rotor),) if rotor else (), (free,))
-        assert answer._against(remains, candidate, data, point).found == against
-    for name, against in (("velocity_scale", False), ("gyro_bias", True), ("linear_drag", True)):
-        assert answer._against(swinging, Candidate(name, (), ("x",)), data, point).found == against
+    for said, factor in (
+        (remains, CONFIDENCE.doubtful),
+        (remains.without_random_rotor(), 1.0),
+        (remains.without_random_rotor(4), 1.0),  # nor against its being weak
+        (remains.without_random_rotor(1), CONFIDENCE.doubtful),
+        (swinging.without_random_rotor(), CONFIDENCE.doubtful),
+    ):
+        assert confidence_factor(said) == factor
+    data, point = nominal_of(fly(seconds=8.0))
+    for left_over, name, fixed, free, against in (
+        (remains, "linear_drag", (), "x", False),
+        (remains, "inertia_products", (), "xy", True),
+        (remains, "rotor_fault", (("rotor", 4),), "scale", False),
+        (remains, "rotor_fault", (("rotor", 1),), "scale", True),
+        (swinging, "velocity_scale", (), "x", False),
+        (swinging, "gyro_bias", (), "x", True),
+        (swinging, "linear_drag", (), "x", True),
+    ):
+        assert answer._against(left_over, Candidate(name, fixed, (free,)), data, point).found == against

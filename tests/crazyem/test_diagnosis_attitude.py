@@ -6,11 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from closed_loop import DRONE, fly
+from diagnosis_parts import data_of, start_point
 from made_flight import array_of
 
-from crazyem.diagnosis.fitting.fit import Data, nominal
-from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import start_noise
+from crazyem.diagnosis.fitting.fit import nominal
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.estimation import steps
@@ -111,8 +110,8 @@ def test_errors_that_last_are_found_and_are_no_noise_of_the_gyro() -> None:
     """Errors of 4 mrad about two of three axes that last 0.04 s: gyro and shaking stay as without such errors."""
     recording = fly(seconds=15.0, seed=5, rate_noise=2e-3, shake=0.3)
     right, wrong = (
-        refine_base(data, nominal(data, Point(DRONE, {}, start_noise())), ()).point.noise
-        for data in (Data([flight_of(onboard(recording, wrong=w), DRONE)]) for w in (False, True))
+        refine_base(data, nominal(data, start_point()), ()).point.noise
+        for data in (data_of(onboard(recording, wrong=w)) for w in (False, True))
     )
     assert wrong.measurement[3] == pytest.approx(right.measurement[3], rel=0.2)
     np.testing.assert_allclose(wrong.impulse[3:], right.impulse[3:], rtol=0.05)

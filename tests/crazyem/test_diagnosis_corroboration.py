@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
-from made_flight import array_of
+from diagnosis_parts import LAG, LATE, data_of, nominal_of, start_point
+from made_flight import array_of, changed
 from scipy.special import expit, logit
 
 from crazyem.diagnosis.diagnose import _corroborated
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, with_torque_memory
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.place import depends_on_place
@@ -37,7 +37,7 @@ from crazyem.recordings.recording import Recording
 
 
 def point_of(data: Data) -> Point:
-    return nominal(data, Point(DRONE, {}, start_noise()))
+    return nominal(data, start_point())
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,6 @@ def test_commands_tell_a_sensor_that_counts_wrong_from_a_weak_rotor(recording: R
     healthy = with_speeds(recording, (1.0, 1.0, 1.0, 1.0))
     lag = 1e-3  # the made speeds answer at once
     said, unsaid = false_speed([counts_wrong], 2, 1.06, lag), false_speed([healthy], 2, 1.06, lag)
-    assert said is not None
     assert unsaid is not None
     assert said > 10.0
     assert unsaid < -10.0
@@ -74,7 +73,7 @@ def test_commands_tell_a_sensor_that_counts_wrong_from_a_weak_rotor(recording: R
 @pytest.mark.parametrize("named", ["rotor_fault", "rotor_sensor"])
 def test_what_commands_say_counts_for_a_sensor_that_counts_wrong(recording: Recording, named: str) -> None:
     """Also where a steady balance had taken it for a weak rotor: then that balance decides nothing any more."""
-    data, scale = Data([flight_of(recording, DRONE)]), 1.06
+    data, scale = data_of(recording), 1.06
     start = point_of(data)
     candidate = Candidate(named, (("rotor", 2),), ("scale",))
     values = {"rotor": 2, "scale": scale if named == "rotor_sensor" else scale**-2}
@@ -88,7 +87,6 @@ def test_what_commands_say_counts_for_a_sensor_that_counts_wrong(recording: Reco
     shown = with_speeds(recording, (1.0, scale, 1.0, 1.0))
     found, witnessed = _corroborated(data, None, selection, [shown])
     one = found.steps[0].taken
-    assert one is not None
     assert (one.candidate.effect, one.log_odds) == ("rotor_sensor", None)
     expected = false_speed([shown], 2, scale, DRONE.motor_time_constant)
     assert expected is not None
@@ -120,35 +118,28 @@ def felt(recording: Recording, late: float, shaken: float = 1.0) -> Recording:
     return replace(recording, signals={**recording.signals, "specific_force": shown})
 
 
-def test_an_accelerometer_tells_late_forces_from_late_measurements(recording: Recording, sudden: Recording) -> None:
-    said = []
-    for late in (0.0, 0.020):
-        data = Data([flight_of(felt(sudden, late), DRONE)])
-        found = late_measurements(data, point_of(data), 0.020)
-        assert found is not None
-        said.append(found)
-    assert said[0] > 3.0  # punctual forces speak for late measurements,
-    assert said[1] < -3.0  # late ones for late inputs
-    data = Data([flight_of(recording, DRONE)])
-    assert late_measurements(data, point_of(data), 0.010) is None  # no accelerometer
+@pytest.mark.parametrize(("late", "sign"), [(0.0, 1.0), (0.020, -1.0)], ids=["punctual", "late"])
+@pytest.mark.parametrize("start", ["sudden", "slow"])
+def test_an_accelerometer_tells_late_forces_from_late_measurements(recording, sudden, late, sign, start):
+    """Punctual forces speak for late measurements, late ones for late inputs. Without a sudden start, forces in the
+    band tell the lag; slow ones, which the model may lack, do not."""
+    shown = felt(sudden if start == "sudden" else recording, late)
+    if start == "slow":
+        force = shown.signals["specific_force"].value
+        drift = np.linspace(0.0, 1.0, len(force))
+        shown = changed(shown, "specific_force", value=force + np.outer(drift, [0.0, 0.0, 1.0]))
+    data, point = nominal_of(shown)
+    assert sign * late_measurements(data, point, 0.020) > (3.0 if start == "sudden" else SELECTION.separating)
 
 
-def test_a_flight_without_a_sudden_start_tells_a_delay_too(recording: Recording) -> None:
-    """Forces in the band tell the lag; slow ones, which the model may lack, do not."""
-    for late, sign in ((0.0, 1.0), (0.020, -1.0)):
-        shown = felt(recording, late)
-        force, drift = shown.signals["specific_force"], np.linspace(0.0, 1.0, shown.signals["specific_force"].time.size)
-        slow = array_of("specific_force", force.time, force.value + np.outer(drift, [0.0, 0.0, 1.0]), place=91)
-        data = Data([flight_of(replace(shown, signals={**shown.signals, "specific_force": slow}), DRONE)])
-        said = late_measurements(data, point_of(data), 0.020)
-        assert said is not None
-        assert sign * said > SELECTION.separating
+def test_without_an_accelerometer_nothing_is_said_of_a_delay(recording):
+    assert late_measurements(*nominal_of(recording), 0.010) is None
 
 
 def test_noise_of_an_accelerometer_does_not_move_its_lag(sudden: Recording) -> None:
     said = []
     for shaken in (1.0, 10.0):
-        data = Data([flight_of(felt(sudden, 0.020, shaken), DRONE)])
+        data = data_of(felt(sudden, 0.020, shaken))
         lag = _lag_of(data.models[0], point_of(data))
         assert lag is not None
         said.append(lag)
@@ -160,27 +151,27 @@ def test_a_witness_is_heard_on_the_flights_held_out_too(sudden: Recording) -> No
     """The accelerometer of the flight that was fitted says nothing, that of the one kept apart tells late from
     punctual."""
     silent = felt(sudden, 0.0, shaken=1e4)
-    data = Data([flight_of(silent, DRONE)])
+    data = data_of(silent)
     nominal = point_of(data)
-    late = Candidate("input_delay", (), ("delay",))
+    late = LATE
     final = nominal.with_effects({"input_delay": {"delay": 0.020}})
     fitted = Fitted(final, (late,), 0.0, data.gram(final, late.columns(final)), np.zeros(1))
     selection = Selection(nominal, final, (), (late,), fitted)
     assert _corroborated(data, None, selection, [silent])[1] == frozenset()
     for seconds, told in ((0.0, {"measurement_delay", "input_delay"}), (0.020, {"input_delay"})):
-        apart = Data([flight_of(felt(sudden, seconds), DRONE)])
+        apart = data_of(felt(sudden, seconds))
         assert _corroborated(data, apart, selection, [silent])[1] == told
 
 
 def test_a_group_holds_the_name_that_is_told(recording: Recording) -> None:
     """Late inputs and late measurements are one model, fitted as the first; told as the second, so is its group."""
-    data = Data([flight_of(recording, DRONE)])
+    data = data_of(recording)
     start = point_of(data)
-    late = Candidate("input_delay", (), ("delay",))
+    late = LATE
     fitted = refine_base(data, start.with_effects({"input_delay": {"delay": 0.01}}), [late], rounds=1, noise=False)
     own = data.block_loglik(fitted.point)
     taken = Trial(late, 50.0, 0.0, 1.0, 50.0, fitted, True, own, 50.0)
-    lag = replace(taken, candidate=Candidate("motor_lag", (), ("time_constant",)))
+    lag = replace(taken, candidate=LAG)
     selection = Selection(start, fitted.point, (Step((taken, lag), taken, (lag,)),), (late,), fitted)
     for witnessed, name, group in (
         ({"measurement_delay", "input_delay"}, "measurement_delay", ("measurement_delay", "motor_lag")),
@@ -201,8 +192,8 @@ def test_blocks_know_their_recording() -> None:
 
 def test_sampled_commands_are_torques_with_the_memory_of_the_lag() -> None:
     """A noisy gyro at 500 Hz makes commands of which the log at 100 Hz sees every fifth."""
-    data = Data([flight_of(fly(rate_noise=0.15, shake=0.02, seconds=9.0), DRONE)])
-    white = Point(DRONE, {}, start_noise())
+    data = data_of(fly(rate_noise=0.15, shake=0.02, seconds=9.0))
+    white = start_point()
     data.settle(white)
     white = data.fit_noise(white)
     remembered = with_torque_memory(data, white)
@@ -212,10 +203,9 @@ def test_sampled_commands_are_torques_with_the_memory_of_the_lag() -> None:
 
 
 def test_a_force_that_depends_on_place_holds_on_the_next_flight() -> None:
-    pulled = [Data([flight_of(fly(Hidden(rope=0.02), seed=s, seconds=9.0), DRONE)]) for s in (1, 2)]
-    free = [Data([flight_of(fly(seed=s, seconds=9.0), DRONE)]) for s in (1, 2)]
+    pulled = [data_of(fly(Hidden(rope=0.02), seed=s, seconds=9.0)) for s in (1, 2)]
+    free = [data_of(fly(seed=s, seconds=9.0)) for s in (1, 2)]
     found = depends_on_place(pulled[0], pulled[1], settled(pulled))
-    assert found is not None
     assert (found.finding.signal, found.finding.axis, found.finding.variable) == ("force", "x", "x")
     assert depends_on_place(free[0], free[1], settled(free)) is None
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
+from diagnosis_parts import DRAG, LOAD, WIND, data_of, silent, start_point
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,10 +15,7 @@ from crazyem.diagnosis.diagnose import Diagnosis, diagnose
 from crazyem.diagnosis.document import document_of
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
-from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
-from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import determined as deciding
 from crazyem.diagnosis.naming.determined import determined, without_undetermined
 from crazyem.diagnosis.naming.named import Named, Value, interval_95
@@ -25,7 +23,7 @@ from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings.recording import Recording
 
-POINT = Point(DRONE, {}, start_noise())
+POINT = start_point()
 OWN = dict(zip(("xx", "yy", "zz", "time_constant"), (*DRONE.inertia, DRONE.motor_time_constant), strict=True))
 
 
@@ -137,7 +135,7 @@ def test_an_axis_without_any_is_no_reason_and_intervals_end_where_the_range_does
 
 @pytest.fixture(scope="module")
 def dragged() -> Data:
-    return Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02)), seconds=6.0), DRONE)])
+    return data_of(fly(Hidden(drag=(0.02, 0.02, 0.02)), seconds=6.0))
 
 
 def selected(data: Data, *candidates: Candidate, **values: dict[str, float]) -> Selection:
@@ -149,11 +147,8 @@ def selected(data: Data, *candidates: Candidate, **values: dict[str, float]) -> 
     return Selection(point, fitted.point, steps, candidates, fitted)
 
 
-DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
-
-
 def test_what_is_not_determined_is_left_out_and_the_rest_fitted_again(dragged: Data) -> None:
-    wind = Candidate("wind", (), ("x", "y", "z"))
+    wind = WIND
     selection = selected(dragged, wind, DRAG, wind={"x": 0.01}, linear_drag=dict.fromkeys("xyz", 0.02))
     said: list[str] = []
     left, balance, gone = without_undetermined(dragged, selection, None, said.append)
@@ -170,12 +165,12 @@ def test_what_is_not_determined_is_left_out_and_the_rest_fitted_again(dragged: D
 def test_a_number_at_its_end_is_held_at_none_and_the_others_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """A load 40 mm above the rotors; its weight and where it draws the drone are determined."""
     monkeypatch.setattr(deciding, "improbable", lambda chance: "")  # however sure it is
-    load = Candidate("payload", (), ("mass", "x", "y", "z"))
-    flown = Data([flight_of(fly(Hidden(thrust=(0.9,) * 4), seconds=6.0), DRONE)])
+    load = LOAD
+    flown = data_of(fly(Hidden(thrust=(0.9,) * 4), seconds=6.0))
     selection = selected(flown, load, payload={"mass": 0.004, "x": 0.0, "y": 0.0, "z": 0.04})
     values = {**selection.final.effects["payload"], "z": 0.04}
     selection = replace(selection, final=selection.final.with_effects({"payload": values}))
-    left, _, gone = without_undetermined(flown, selection, None, lambda text: None)
+    left, _, gone = without_undetermined(flown, selection, None, silent)
     assert gone == {}
     assert [c.free for c in left.accepted] == [("mass", "x", "y")]
     assert left.final.effects["payload"]["z"] == 0.0

@@ -8,22 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from closed_loop import CONTROL, DRONE, LOG, PER_VOLT, SIGNS, G, Hidden, fly
+from closed_loop import DRONE, LOG, PER_VOLT, SIGNS, G, Hidden, fly
+from diagnosis_parts import TORQUE, data_of, start_point
 from numpy.typing import NDArray
+from test_diagnosis_determined import impossible
 
 from crazyem.cli import main
 from crazyem.diagnosis.diagnose import Diagnosis, diagnose
 from crazyem.diagnosis.document import document_of
-from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.fitting.fit import Data
-from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
-from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.prediction.horizon import UNITS
 from crazyem.physics.effects.catalogue import CATALOGUE
-from crazyem.physics.motion import vehicle_values
-from crazyem.recordings import open_recording
 from crazyem.recordings.mcap.signals import write_recording
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import load_vehicle
@@ -81,7 +76,8 @@ def schema(document: dict[str, Any], *, held_out: bool) -> None:
                 assert set(parameter) == {"value", "unit", "sd", "ci95"}
                 assert parameter["unit"] == known[name]
                 assert parameter["ci95"][0] <= parameter["value"] <= parameter["ci95"][1]
-        assert possible(effect) == []
+        told = {n: (v["value"], *v["ci95"]) for n, v in effect["parameters"].items() if not v.get("chosen")}
+        assert impossible(effect["name"], told) == []
     assert all(tried["p_value"] is None for tried in document["ranking"])
     assert all(isinstance(n, TEXT) for group in document["indistinguishable"] for n in group)
     assert all(isinstance(t, TEXT) for t in document["would_separate"])
@@ -95,23 +91,6 @@ def schema(document: dict[str, Any], *, held_out: bool) -> None:
     assert all({"quantity", "horizon_s"} <= set(w) for part in document["fit"].values() for w in part.get("worse", ()))
     assert {(e["words"], e["parameter"]) for e in document["left_free"]} >= {("input delay", "delay")}
     finite(document)
-
-
-def possible(effect: dict[str, Any]) -> list[str]:
-    """What is wrong with the numbers of an effect of a document: outside their range, at its end, or perhaps none."""
-    wrong, holds_none = [], []
-    for p in CATALOGUE[effect["name"]].parameters:
-        told = effect["parameters"].get(p.name, {"chosen": True})
-        if told.get("chosen"):
-            continue
-        none = vehicle_values(DRONE).get(effect["name"], {}).get(p.name, 0.0) if p.neutral != p.neutral else p.neutral
-        low, high = told["ci95"]
-        if not p.low <= low <= told["value"] <= high <= p.high:
-            wrong.append(f"{p.name}: {told['value']} ({low} to {high})")
-        if told["value"] in (p.low, p.high) and told["value"] != none:
-            wrong.append(f"{p.name} at its end")
-        holds_none.append(low <= none <= high)
-    return wrong + ["it may be none"] * (bool(holds_none) and all(holds_none))
 
 
 def finite(value: Any) -> None:
@@ -209,35 +188,35 @@ def regressed(recording: Recording) -> NDArray[np.float64]:
 
 def gain(recording: Recording, *, sway: float) -> tuple[float, float]:
     """The factor on the torques by the likelihood, and its standard deviation; `sway` begins the disturbances."""
-    data = Data([flight_of(recording, DRONE)])
-    point = Point(DRONE, {}, start_noise())
+    data = data_of(recording)
+    point = start_point()
     disturbance = np.array([0.0] * 3 + [sway] * 3)
     point = replace(point, noise=replace(point.noise, disturbance=disturbance, memory=1.0))
     data.settle(point)
     point = data.fit_noise(point).with_effects({"torque_scale": {"scale": 1.0}})
-    fitted = refine_base(data, point, [Candidate("torque_scale", (), ("scale",))])
+    fitted = refine_base(data, point, [TORQUE])
     solution = fitted.gram.solve(range(fitted.gram.size), precision=fitted.precision)
     return fitted.point.effects["torque_scale"]["scale"], float(np.sqrt(solution.covariance[0, 0]))
 
 
-def test_feedback_from_a_noisy_gyro_does_not_bend_a_gain() -> None:
-    """Noise of a rate is in the command that answers to it and in the difference that begins with it: regression finds
-    a gain that is not there and misses the one that is; the likelihood holds it."""
-    recording = fly(Hidden(torque=0.8), rate_noise=0.1, seconds=15.0)
-    assert np.all(regressed(recording) > 0.88)
-    value, sd = gain(recording, sway=0.0)
+@pytest.mark.parametrize(
+    ("made", "regression", "sway", "unsure"),
+    [
+        # noise of a rate is in the command that answers to it and in the difference that begins with it: regression
+        # finds a gain that is not there; what a loop sends between logged commands is not known, which widens the sd
+        ({"rate_noise": 0.1}, (0.88, np.inf), 0.0, 0.1),
+        # commands are mostly minus the disturbance; disturbances as states, with twice the true memory, leave the gain
+        ({"sway": 5.0}, (-np.inf, 0.5), 2.0, 0.07),
+    ],
+    ids=["feedback from a noisy gyro", "disturbances that the controller fights"],
+)
+def test_a_closed_loop_does_not_bend_a_gain(made, regression, sway, unsure):
+    recording = fly(Hidden(torque=0.8), seconds=15.0, **made)
+    low, high = regression
+    assert np.all((low < regressed(recording)) & (regressed(recording) < high))
+    value, sd = gain(recording, sway=sway)
     assert abs(value - 0.8) < 2.5 * sd
-    assert sd < 0.1  # what a loop sends between logged commands is not known, and a noisy gyro makes that much
-
-
-def test_disturbances_that_the_controller_fights_do_not_shrink_a_gain() -> None:
-    """Commands are mostly minus the disturbance: regression halves the gain. Disturbances as states, with twice the
-    true memory, leave it as it is."""
-    recording = fly(Hidden(torque=0.8), sway=5.0, seconds=15.0)
-    assert np.all(regressed(recording) < 0.5)
-    value, sd = gain(recording, sway=2.0)
-    assert abs(value - 0.8) < 2.5 * sd
-    assert sd < 0.07
+    assert sd < unsure
 
 
 # -- the command ----------------------------------------------------------------------------------------------------
@@ -342,21 +321,3 @@ def test_a_drone_that_stands_still_is_not_diagnosed(tmp_path: Path, capsys: pyte
     code, sentence = said(capsys, tmp_path / "still.mcap", "--vehicle", tmp_path / "made.toml")
     assert code == 5
     assert "nothing was flown" in sentence
-
-
-def test_the_made_flights_are_flights() -> None:
-    """The oracle itself: logged at 100 Hz, it follows its path, and commands stay within what rotors can give."""
-    recording = fly(seconds=5.0)
-    assert np.allclose(np.diff(recording.signals["position"].time), LOG)
-    assert CONTROL < LOG
-    assert np.abs(recording.signals["body_rate"].value).max() < 5.0
-    assert np.abs(recording.signals["position"].value[:, :2]).max() < 1.5
-    assert recording.signals["motor_command"].value.min() > 0.0
-    assert recording.signals["motor_command"].value.max() < 1.0
-
-
-def test_a_recording_written_and_read_again_is_diagnosed_the_same(flown: Path, dragged: list[Recording]) -> None:
-    again = flight_of(open_recording(flown / "drag.mcap"), DRONE)
-    here = flight_of(dragged[0], DRONE)
-    np.testing.assert_array_equal(again.y, here.y)
-    np.testing.assert_array_equal(again.starts, here.starts)

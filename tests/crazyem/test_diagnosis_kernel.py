@@ -365,17 +365,6 @@ def test_columns_change_nothing_of_the_filter() -> None:
     np.testing.assert_array_equal(without.filtered, beside.filtered)
 
 
-def test_a_start_forgets_what_was_before() -> None:
-    """The second stretch of a flight gives the same innovations alone as after the first."""
-    given = made(4, disturbed=True, missing=0.2)
-    half = len(given.time) // 2
-    alone = replace(given, **{n: getattr(given, n)[half:] for n in ("time", "starts", "y", "specific", "angular",
-                                                                   "offset")})  # fmt: skip
-    whole, second = swept(given), swept(alone)
-    np.testing.assert_array_equal(whole.e[half:], second.e)
-    np.testing.assert_array_equal(whole.filtered[half:], second.filtered)
-
-
 def test_a_row_without_a_measurement_only_predicts() -> None:
     given = made(5)
     y = given.y.copy()
@@ -386,39 +375,3 @@ def test_a_row_without_a_measurement_only_predicts() -> None:
     dt = given.time[10] - given.time[9]
     expected = stepped(found.filtered[9], dt, given.specific[10], given.angular[10], given.memory)
     assert np.max(np.abs(minus(found.filtered[10], expected))) < 1e-12
-
-
-@pytest.mark.parametrize(("coloured", "thrust_only"), [((), False), ((0, 1, 2, 3), False), ((0, 1, 2), True)])
-def test_white_innovations_where_model_and_noise_are_true(coloured: tuple[int, ...], thrust_only: bool) -> None:
-    """On data drawn from the model itself, squared standardised innovations sum to a chi-squared number (5 sigma)."""
-    given = drawn(6, rows=400, coloured=coloured, thrust_only=thrust_only)
-    found = swept(given)
-    seen = found.s > 0
-    z = found.e[seen] / np.sqrt(found.s[seen])
-    assert abs(np.sum(z**2) - z.size) < 5 * np.sqrt(2 * z.size)
-    assert abs(z.mean()) < 5 / np.sqrt(z.size)
-
-
-@pytest.mark.parametrize("thrust_only", [False, True])
-def test_the_likelihood_tells_whether_an_estimate_knows_lateral_forces(thrust_only: bool) -> None:
-    given = drawn(7, rows=400, coloured=(0, 1, 2), thrust_only=thrust_only)
-    assert swept(given).loglik > swept(replace(given, thrust_only=not thrust_only)).loglik + 10.0
-
-
-def drawn(seed: int, rows: int, coloured: tuple[int, ...] = (), thrust_only: bool = False) -> Given:
-    """Impulses, measurement noise, disturbances and errors with memory drawn with the given variances; 2 stretches."""
-    given = replace(made(seed, rows=rows, disturbed=True, coloured=coloured), thrust_only=thrust_only)
-    rng = np.random.default_rng(seed)
-    y, x = given.y.copy(), np.zeros(31)
-    for k in range(rows):
-        if k == 0 or given.starts[k]:
-            x = np.concatenate([begun(made(seed, rows=rows).y[0], given.offset[0])[:13],
-                                rng.normal(size=18) * np.sqrt(given.disturbance)])  # fmt: skip
-        else:
-            dt = given.time[k] - given.time[k - 1]
-            end = stepped(x, dt, given.specific[k], given.angular[k], given.memory, given.coupled, given.thrust_only)
-            spread = np.linalg.cholesky(process_noise(given, x, end, dt) + 1e-18 * np.eye(30))
-            x = plus(end, spread @ rng.normal(size=30))
-        noise = rng.normal(size=12) * np.sqrt(given.r)
-        y[k] = plus(x, np.concatenate([noise + given.offset[k] + x[19:], np.zeros(18)]))[:13]
-    return replace(given, y=y)

@@ -6,13 +6,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from diagnosis_parts import start_point
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_flight import Motion, changed, made_flight, without
 
 from crazyem.diagnosis.fitting.candidates import candidates_for
-from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import without_unobservable
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.flights.inputs import inputs_of
@@ -37,7 +36,6 @@ def inputs(recording, vehicle=DRONE):
 def test_the_voltage_is_the_one_that_the_battery_had(seed):
     """Of a drone whose mass and thrust curve are right, whatever it flies; the voltage that was left out tells."""
     found = inputs(unmeasured(replace(MOTION, seed=seed)))
-    assert found.level is not None
     middle = found.level.known - 1.5
     assert found.level.voltage == pytest.approx(float(MOTION.voltage(np.array([middle]))[0]), rel=0.003)
     assert f"{found.level.voltage:.2f} V is taken" in found.notices[0]
@@ -51,7 +49,6 @@ def test_heights_tell_it_where_no_velocity_is_recorded(seed):
     noise = 1e-3 * np.random.default_rng(seed).standard_normal(height.value.shape)
     for recording in (shown, changed(shown, "position", value=height.value + noise)):
         found = inputs(recording)
-        assert found.level is not None
         middle = found.level.known - 1.5
         assert found.level.voltage == pytest.approx(float(MOTION.voltage(np.array([middle]))[0]), rel=0.005)
 
@@ -62,7 +59,6 @@ def test_commands_carry_the_vehicle_whatever_its_mass(factor):
     """Thrust over mass is what the flight shows: of a vehicle file that is wrong by any factor, too."""
     recording = unmeasured()
     found = inputs(recording, replace(DRONE, mass=factor * DRONE.mass))
-    assert found.level is not None
     there = (found.rotor.time > found.level.known - 3.0) & (found.rotor.time < found.level.known)
     lifted = found.rotor.thrust[there].sum(1).mean() / (factor * DRONE.mass)
     up = MOTION.acceleration(found.rotor.time[there]) + np.array([0.0, 0.0, GRAVITY])
@@ -136,7 +132,7 @@ def test_how_heavy_or_strong_the_drone_is_is_left_open():
     flight = flight_of(unmeasured(), DRONE)
     assert flight.levelled
     assert not flight_of(made_flight(MOTION, noise=0.0), DRONE).levelled
-    point = Point(DRONE, {}, start_noise())
+    point = start_point()
     found, left_out = candidates_for(point, flight.signals, measured_speeds=False)
     data = SimpleNamespace(flights=[flight], coarse=False)
     kept, reasons = without_unobservable(data, point, found, left_out)

@@ -7,22 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
+from diagnosis_parts import DRAG, LOAD, nominal_of, start_point
 from unknown_effects import unknown
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
-from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
-from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import load_or_rotors
 from crazyem.diagnosis.naming.answer import answer_of
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, margin
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.physics.effects.catalogue import CATALOGUE
-
-LOAD = Candidate("payload", (), ("mass", "x", "y", "z"))
-DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
 
 
 def selection_of(point: Point, accepted: tuple[Candidate, ...], fitted: Any = None) -> Selection:
@@ -36,8 +32,8 @@ def test_what_stands_in_the_place_of_a_load_pays_for_its_parameters_and_for_bein
 ) -> None:
     """Weaker rotors `alone` [nats] or, where they do not explain the torque of a load, with a shifted centre (104)."""
     vehicle = DRONE if not trim else SimpleNamespace(**{**vars(DRONE), "effects": {TRIM: {"x": 0.0}}})
-    effects = {"payload": LOAD.neutral(Point(DRONE, {}, start_noise())), "linear_drag": dict.fromkeys("xyz", 0.01)}
-    point = Point(vehicle, effects, start_noise())  # type: ignore[arg-type]
+    effects = {"payload": LOAD.neutral(start_point()), "linear_drag": dict.fromkeys("xyz", 0.01)}
+    point = Point(vehicle, effects, start_noise())
     asked = []
 
     def judged(data: Any, held_out: Any, start: Point, candidates: Any) -> tuple[float, Any, Any]:
@@ -47,7 +43,7 @@ def test_what_stands_in_the_place_of_a_load_pays_for_its_parameters_and_for_bein
         return value, np.zeros(5), unknown(candidates)
 
     monkeypatch.setattr(load_or_rotors, "refitted", judged)
-    found = load_or_rotors.load_against_rotors(SimpleNamespace(), None, selection_of(point, (LOAD, DRAG)))  # type: ignore[arg-type]
+    found = load_or_rotors.load_against_rotors(SimpleNamespace(), None, selection_of(point, (LOAD, DRAG)))
     assert found is not None
     both = ["thrust_scale"] if trim else ["thrust_scale", "center_of_mass"]
     assert asked[0][0] == ["payload", "linear_drag"]
@@ -62,7 +58,7 @@ def test_what_stands_in_the_place_of_a_load_pays_for_its_parameters_and_for_bein
 
 def test_without_a_load_nothing_is_asked() -> None:
     point = Point(DRONE, {"linear_drag": dict.fromkeys("xyz", 0.01)}, start_noise())
-    assert load_or_rotors.load_against_rotors(SimpleNamespace(), None, selection_of(point, (DRAG,))) is None  # type: ignore[arg-type]
+    assert load_or_rotors.load_against_rotors(SimpleNamespace(), None, selection_of(point, (DRAG,))) is None
 
 
 @pytest.mark.parametrize(("scale", "tried", "asked_for"), [(0.8, False, True), (1.1, False, False), (0.8, True, False)])
@@ -78,9 +74,9 @@ def test_a_load_in_the_place_of_weaker_rotors_weighs_what_they_lack(
 
     monkeypatch.setattr(load_or_rotors, "refitted", judged)
     chosen = selection_of(point, (load_or_rotors.WEAKER, DRAG))
-    beside = Trial(LOAD, 1.0, 1.0, 1.0, 1.0, fitted=SimpleNamespace() if tried else None)  # type: ignore[arg-type]
+    beside = Trial(LOAD, 1.0, 1.0, 1.0, 1.0, fitted=SimpleNamespace() if tried else None)
     chosen = replace(chosen, steps=(replace(chosen.steps[0], trials=(beside,)), *chosen.steps[1:]))
-    found = load_or_rotors.rotors_against_load(SimpleNamespace(), None, chosen)  # type: ignore[arg-type]
+    found = load_or_rotors.rotors_against_load(SimpleNamespace(), None, chosen)
     assert (found is not None) == asked_for == bool(asked)
     if found is not None:
         assert [names for names, _ in asked] == [["thrust_scale", "linear_drag"], ["linear_drag", "payload"]]
@@ -90,8 +86,7 @@ def test_a_load_in_the_place_of_weaker_rotors_weighs_what_they_lack(
 
 
 def test_weighing_is_asked_for_whether_a_load_is_told_apart_or_not() -> None:
-    data = Data([flight_of(fly(Hidden(thrust=(0.9, 0.9, 0.9, 0.9)), seconds=8.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, start_noise()))
+    data, point = nominal_of(fly(Hidden(thrust=(0.9, 0.9, 0.9, 0.9)), seconds=8.0))
     begun = point.with_effects({"payload": {**LOAD.neutral(point), "mass": 0.0039}})
     fitted = refine_base(data, begun, [LOAD], rounds=1, noise=False)
     trial = Trial(LOAD, 50.0, 0.0, 1.0, 46.0, fitted, True, np.zeros(8), 50.0)
@@ -107,8 +102,7 @@ def test_weighing_is_asked_for_whether_a_load_is_told_apart_or_not() -> None:
 @pytest.mark.slow
 def test_rotors_that_are_all_weaker_are_not_told_from_a_load() -> None:
     """A tenth less thrust: a load of 3.9 g in the middle explains it but for the torque, which the two get right."""
-    data = Data([flight_of(fly(Hidden(thrust=(0.9, 0.9, 0.9, 0.9)), seconds=12.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, start_noise()))
+    data, point = nominal_of(fly(Hidden(thrust=(0.9, 0.9, 0.9, 0.9)), seconds=12.0))
     begun = point.with_effects({"payload": {**LOAD.neutral(point), "mass": 0.0039}})
     fitted = refine_base(data, begun, [LOAD])
     found = load_or_rotors.load_against_rotors(data, None, selection_of(fitted.point, (LOAD,), fitted))

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
+from diagnosis_parts import INERTIA, LAG, data_of, start_point
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.fitting.fit import Data, Fitted, bounds_of, nominal
+from crazyem.diagnosis.fitting.fit import Fitted, bounds_of, nominal
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import error_by_lag, nuisances, refine_base, systematic_sd
-from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.naming import answer, trials
 from crazyem.diagnosis.naming.answer import _numbers, _rivals, _uncertainty, strongest_first
@@ -202,7 +202,7 @@ def test_intervals_count_by_how_much_flights_differ_where_there_are_many() -> No
 
 
 def test_what_no_scatter_shows_is_part_of_an_interval() -> None:
-    data = Data([flight_of(fly(seconds=6.0), DRONE)])
+    data = data_of(fly(seconds=6.0))
     never = systematic_sd(data, point_of(suspended_load={"mass": 0.002, "length": 0.4}))
     assert never["suspended_load", "length"] == pytest.approx(0.002)
     assert never["suspended_load", "mass"] == pytest.approx(3e-3 * DRONE.mass)
@@ -216,8 +216,8 @@ def test_what_no_scatter_shows_is_part_of_an_interval() -> None:
 
 def test_inertias_are_as_unsure_as_a_lag_that_is_a_little_wrong_makes_them() -> None:
     """Held to a lag 3 ms longer, they are elsewhere by as much."""
-    data = Data([flight_of(fly(seconds=8.0), DRONE)])
-    inertia = Candidate("inertia", (), ("xx", "yy", "zz"))
+    data = data_of(fly(seconds=8.0))
+    inertia = INERTIA
     start = nominal(data, point_of()).with_effects({"inertia": dict(zip(inertia.free, DRONE.inertia, strict=True))})
     fitted = refine_base(data, start, [inertia], rounds=3, noise=False)
     off = error_by_lag(data, fitted)
@@ -234,9 +234,7 @@ def test_inertias_are_as_unsure_as_a_lag_that_is_a_little_wrong_makes_them() -> 
         assert off["inertia", name] == pytest.approx(abs(theta[1][k] - theta[0][k]), rel=1e-3)
         assert off["inertia", name] > 0.003 * DRONE.inertia[k]
     assert len(off) == 3
-    assert (
-        error_by_lag(data, refine_base(data, start, [Candidate("motor_lag", (), ("time_constant",))], rounds=1)) == {}
-    )
+    assert error_by_lag(data, refine_base(data, start, [LAG], rounds=1)) == {}
 
 
 @pytest.mark.parametrize(
@@ -264,7 +262,7 @@ def test_what_is_needed_beside_a_name_is_no_other_name_for_it(accepted: list[str
 
 
 def test_later_effects_are_told_by_how_many_were_found_before_them_but_a_trim() -> None:
-    names, point = ("wind", "trim", "payload", "motor_lag"), Point(DRONE, {}, start_noise())
+    names, point = ("wind", "trim", "payload", "motor_lag"), start_point()
     steps = tuple(Step((), Trial(Candidate(n, (), ()), 1.0, 1.0, 1.0, 1.0)) for n in names)
-    selection = Selection(point, point, (*steps, Step((), None)), (), SimpleNamespace())  # type: ignore[arg-type]
+    selection = Selection(point, point, (*steps, Step((), None)), (), SimpleNamespace())
     assert selection.orders() == [1, 2, 2, 3]

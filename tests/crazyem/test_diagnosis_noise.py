@@ -141,13 +141,6 @@ def test_long_flights_are_judged_by_stretches_all_over() -> None:
     assert sample_rows(flight.rows(np.arange(1000) < 500), rows=500, stretch=100).all()
 
 
-def test_logarithms_and_back() -> None:
-    again = noise_of(logs_of(TRUE), TRUE)
-    np.testing.assert_allclose(again.impulse, TRUE.impulse)
-    np.testing.assert_allclose(again.measurement, TRUE.measurement)
-    assert not again.disturbance.any()
-
-
 @pytest.mark.parametrize(
     ("memories", "lasting", "onboard"),
     [((), (), False), ((3, 4, 5), (), False), ((0, 1, 2, 3, 4, 5), (), False), ((), (2,), False),

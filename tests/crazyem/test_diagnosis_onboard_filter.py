@@ -1,24 +1,28 @@
-"""What filters on board do to the log: the offset against a low-passed path, and the lags back from a made flight."""
+"""What filters on board do to the log: against a low-passed path, and lags of made flights; a gyro that is late."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
+from diagnosis_parts import data_of, nominal_of, start_point
 from made_flight import array_of
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_continuous_are
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.fit import nominal
 from crazyem.diagnosis.fitting.model import Model, Point
 from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Situation
 from crazyem.physics.effects.onboard_estimate import filtered
+from crazyem.physics.effects.prior import Conditions
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.recording import Recording
 
@@ -135,7 +139,7 @@ def behind(recording: Recording, name: str, lag: float) -> Recording:
 def test_a_log_that_is_late_does_not_tilt_the_filter_on_board():
     """The filter believes a tilted frame, and its velocity is off by it. A late log shows the same filter later."""
     model = Model(replace(flight_of(fly(Hidden(), seconds=6.0, seed=3), DRONE), fused=True))
-    point = Point(DRONE, {}, start_noise())
+    point = start_point()
     model.settle(point)
     acceleration = model.accelerations(point)[0]
 
@@ -164,8 +168,7 @@ def test_lags_of_the_log_are_found(name, parameter, lags):
     free, found = Candidate("onboard_filter", (), ("rate_lag", "velocity_lag")), []
     for lag in lags:
         recording = behind(fly(seconds=12.0, seed=5, rate_noise=2e-3, shake=0.05), name, lag)
-        data = Data([flight_of(recording, DRONE)])
-        point = nominal(data, Point(DRONE, {}, start_noise()))
+        data, point = nominal_of(recording)
         begun = point.with_effects({"onboard_filter": {"rate_lag": 0.0, "velocity_lag": 0.0}})
         found.append(refine_base(data, begun, [free]).point.effects["onboard_filter"][parameter])
     assert found[1] - found[0] == pytest.approx(lags[1], abs=0.3e-3)
@@ -175,10 +178,60 @@ def test_a_torque_that_the_model_lacks_is_no_bias_of_a_late_gyro():
     """Weak rotors on one side are 10 rad/s^2 that the nominal model does not have: 12 mrad/s in a gyro 1.2 ms behind,
     if it were the model's own acceleration by which a late gyro shows less."""
     recording = behind(fly(Hidden(thrust=(0.95, 0.95, 1.0, 1.0)), seconds=10.0, rate_noise=2e-3), "body_rate", 1.2e-3)
-    data = Data([flight_of(recording, DRONE)])
+    data = data_of(recording)
     bias = Candidate("gyro_bias", (), ("x", "y", "z"))
-    point = nominal(data, Point(DRONE, {}, start_noise()))
+    point = nominal(data, start_point())
     begun = refine_base(data, point, ()).point.with_effects({"gyro_bias": dict.fromkeys("xyz", 0.0)})
     found = refine_base(data, begun, [bias]).point
     assert found.noise.disturbance[3:5].max() > 1.0  # the filter carries the torque along as a disturbance
     assert max(abs(v) for v in found.effects["gyro_bias"].values()) < 2e-3
+
+
+# -- a gyro that is late -----------------------------------------------------------------------------------------------
+
+
+GYRO = Candidate("measurement_delay", (("streams", ("gyro",)),), ("delay",))
+
+
+@pytest.mark.parametrize("late", [0.0, 0.003, 0.006])
+def test_a_late_gyro_is_late_by_what_it_was_shifted(late: float) -> None:
+    """With what is always free of onboard filters, which starts at 1.2 ms and is 0 here. By differences of the filtered
+    rates, which hold the noise of the sample that they are to explain, it was 0 for all three."""
+    recording = fly(seconds=8.0, seed=3)
+    rate = recording.signals["body_rate"]
+    shown = array_of("body_rate", rate.time, CubicSpline(rate.time, rate.value)(rate.time - late), place=95)
+    data, point = nominal_of(replace(recording, signals={**recording.signals, "body_rate": shown}))
+    begun = point.with_effects({"measurement_delay": {"delay": 0.002, "streams": ("gyro",)}})
+    found = refine_base(data, begun, [GYRO]).point.effects
+    total = found["measurement_delay"]["delay"] + found["onboard_filter"]["rate_lag"]
+    assert total == pytest.approx(late, abs=0.6e-3)
+
+
+@pytest.mark.parametrize(("onboard", "gyro", "state"), [(True, 0.002, 0.006), (False, 0.003, 0.003)])
+def test_less_of_a_gyro_matters_where_the_attitude_is_made_of_it(onboard: bool, gyro: float, state: float) -> None:
+    prior, conditions = CATALOGUE["measurement_delay"].prior, Conditions(onboard=onboard)
+    for streams, limit in ((("gyro",), gyro), (("state",), state)):
+        assert prior.detection_limit_in({"streams": streams}, conditions)["delay"][1] == limit
+    lags = CATALOGUE["onboard_filter"].prior
+    signals = frozenset({"position", "attitude", "body_rate"})
+    mean = lags.centre_in(replace(conditions, signals=signals))["rate_lag"]
+    sd = lags.usual_in(replace(conditions, signals=signals))["rate_lag"]
+    # a gyro without a filter, and the Crazyflie's of 80 Hz beside a pose that is not made of it
+    assert abs(mean - 0.0) <= 2.0 * sd
+    assert onboard or abs(mean - np.sqrt(2.0) / (2.0 * np.pi * 80.0)) < 1e-4
+
+
+def test_rates_of_motion_alone_are_turned_by_what_acts() -> None:
+    """The rate but for a constant: the sum of angular accelerations over the steps, none across a gap."""
+    recording = fly(seconds=8.0)
+    data, point = nominal_of(recording)
+    model = data.models[0]
+    model.settle(point)
+    with_delay = point.with_effects({"measurement_delay": {"delay": 0.01, "streams": ("gyro",)}})
+    acceleration, situation = model.accelerations(with_delay)
+    offset = model.offsets(with_delay, acceleration)
+    assert model.observed_acceleration is not None
+    rows = np.flatnonzero(~model.flight.starts & (np.diff(model.flight.time, prepend=-1.0) > 0))[5:]
+    assert np.allclose(situation.step[rows], 0.01, atol=1e-4)
+    # a delay of one step of 10 ms takes back what acted over that step
+    assert np.allclose(offset[rows, 9:12], -0.01 * model.observed_acceleration[rows, 3:], atol=2e-4)

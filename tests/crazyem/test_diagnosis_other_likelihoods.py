@@ -8,16 +8,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from diagnosis_parts import nominal_of, silent, start_point
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.compare import compare
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.document import text_of
-from crazyem.diagnosis.fitting.fit import Data, nominal
-from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import start_noise
-from crazyem.diagnosis.flights.flight import flight_of, without
+from crazyem.diagnosis.fitting.fit import Data
+from crazyem.diagnosis.flights.flight import without
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.locating.place import Place
 from crazyem.diagnosis.naming import accelerometer
@@ -43,25 +42,33 @@ def with_values(recording, name, change):
 
 
 def fitted(recording):
-    vehicle = load_vehicle("cf2")
-    data = Data([flight_of(recording, vehicle)])
-    return data, nominal(data, Point(vehicle, {}, start_noise()))
+    return nominal_of(recording, vehicle=load_vehicle("cf2"))
+
+
+NOTHING_LEFT = Unexplained((), 0.0)
+
+
+def judged(data, point, name, remains=NOTHING_LEFT):
+    """What is named beside the regression, where only this effect is asked for."""
+    return other_likelihoods(data, None, point, remains, [name], {}, False, silent)
+
+
+def tilted(recording, roll, pitch):
+    """With the axes of its accelerometer turned in the body by these angles [rad]."""
+    axes = Rotation.from_euler("ZYX", [0.0, pitch, roll]).as_matrix()
+    return with_values(recording, "specific_force", lambda value: value @ axes)
 
 
 @pytest.mark.slow
 def test_a_tilted_accelerometer_is_measured_and_an_upright_one_is_not_accused(recording):
-    roll, pitch = 0.03, -0.02
-    axes = Rotation.from_euler("ZYX", [0.0, pitch, roll]).as_matrix()  # of the sensor, in the body
-    turned = with_values(recording, "specific_force", lambda value: value @ axes)
-    for flown, true in ((turned, (roll, pitch)), (recording, (0.0, 0.0))):
+    turned = tilted(recording, 0.03, -0.02)
+    for flown, true in ((turned, (0.03, -0.02)), (recording, (0.0, 0.0))):
         data, point = fitted(flown)
         solution = accelerometer.tilt(data, point)
         sd = np.sqrt(np.diag(solution.covariance)[:2])
         assert np.all(np.abs(solution.theta[:2] - true) < 4 * sd)
         assert np.all((sd > ACCELEROMETER.angle_sd) & (sd < 2e-3))
-        named = other_likelihoods(
-            data, None, point, Unexplained((), 0.0), [accelerometer.EFFECT], {}, False, lambda text: None
-        )
+        named = judged(data, point, accelerometer.EFFECT)
         assert [f.name for f in named] == [accelerometer.EFFECT] * (flown is turned)
         # thrust along z does not show the yaw: a board's few degrees, not what the residuals' scatter makes of it
         yaw, unsure = solution.theta[2], np.sqrt(solution.covariance[2, 2])
@@ -74,16 +81,13 @@ def test_a_yaw_that_nothing_shows_is_no_tilt(recording, monkeypatch, roll, held,
     """Nor is a roll that held-out flights do not confirm."""
     data, point = fitted(recording)
     solution = accelerometer.tilt(data, point)
-    tilted = replace(solution, theta=np.array([roll, 0.0, 0.08, *np.zeros(4)]),
-                     covariance=np.diag([1e-8, 1e-8, 1e-2, *np.ones(4)]))  # fmt: skip
-    monkeypatch.setattr(accelerometer, "tilt", lambda data, point: tilted)
+    theta, sds = np.array([roll, 0.0, 0.08, *np.zeros(4)]), np.array([1e-4, 1e-4, 0.1, *np.ones(4)])
+    monkeypatch.setattr(accelerometer, "tilt", lambda *_: replace(solution, theta=theta, covariance=np.diag(sds**2)))
     monkeypatch.setattr(accelerometer, "held_out_gain", lambda *given, **more: held)
-    remains = Unexplained((), 0.0)
-    found = other_likelihoods(data, None, point, remains, [accelerometer.EFFECT], {}, False, lambda text: None)
+    found = judged(data, point, accelerometer.EFFECT)
     assert [f.name for f in found] == [accelerometer.EFFECT] * told
     left = Finding("force", "z", "z position", "z", (0.0, 9.0), 5e-3, 5e-4, "N", 250.0, 1e-9)
-    beside = Unexplained((left,), 0.0)
-    doubtful = other_likelihoods(data, None, point, beside, [accelerometer.EFFECT], {}, False, lambda text: None)
+    doubtful = judged(data, point, accelerometer.EFFECT, Unexplained((left,), 0.0))
     for one, other in zip(found, doubtful, strict=True):
         assert other.confidence == pytest.approx(CONFIDENCE.doubtful * one.confidence)
         assert other.log_odds == one.log_odds
@@ -92,8 +96,7 @@ def test_a_yaw_that_nothing_shows_is_no_tilt(recording, monkeypatch, roll, held,
 def test_a_yaw_that_was_not_seen_does_not_cost_what_the_tilt_brings(recording):
     """0.3 rad by a hover, which hardly shows it, spoils what a quick flight with drag says of roll and pitch, unless it
     is known to be unsure."""
-    axes = Rotation.from_euler("ZYX", [0.0, -0.02, 0.03]).as_matrix()
-    data, point = fitted(with_values(recording, "specific_force", lambda value: value @ axes))
+    data, point = fitted(tilted(recording, 0.03, -0.02))
     point = point.with_effects({"linear_drag": {"x": 0.03, "y": 0.03, "z": 0.03}})
     sure, unsure = (
         accelerometer.held_out_gain(data, point, np.array([0.03, -0.02, 0.3]), yaw_sd=sd) for sd in (1e-4, 0.3)
@@ -103,8 +106,7 @@ def test_a_yaw_that_was_not_seen_does_not_cost_what_the_tilt_brings(recording):
 
 def test_what_a_prior_says_is_no_weaker_because_residuals_scatter(recording):
     """A bias that stands for the tilt costs what its prior says, 0.5 (g angle / sd)^2, however the rest scatters."""
-    axes = Rotation.from_euler("ZYX", [0.0, -0.02, 0.03]).as_matrix()
-    data, point = fitted(with_values(recording, "specific_force", lambda value: value @ axes))
+    data, point = fitted(tilted(recording, 0.03, -0.02))
     instead = 0.5 * (0.03**2 + 0.02**2) * (9.81 / ACCELEROMETER.bias_sd) ** 2
     assert instead > 60
     for model in data.models:  # from second to second, on the whole nothing
@@ -135,7 +137,7 @@ def test_moving_air_has_a_memory(memory, found):
         return replace(point, noise=replace(point.noise, disturbance=spread))
 
     data = SimpleNamespace(flights=[SimpleNamespace(duration=60.0)], models=[], loglik=loglik, fit_noise=fit_noise)
-    gusts = find_gusts(data, Point(load_vehicle("cf2"), {}, start_noise()))
+    gusts = find_gusts(data, start_point(load_vehicle("cf2")))
     assert (gusts is not None) == found
     assert gusts is None or gusts.memory == pytest.approx(memory, rel=1e-6)
 
@@ -157,13 +159,19 @@ def test_an_accelerometer_shows_lateral_gusts_that_an_onboard_filter_hides(memor
     assert none < 0.05
 
 
+def gusts_named(monkeypatch, memory, unsure, nats=0.0):
+    """Gusts of 5000 nats and 1.6 m/s, with a memory [s] whose logarithm has this error, beside what is left [nats]."""
+    air = Gusts(5000.0, np.ones(3), memory, unsure, True, 1.6, 0.05)
+    monkeypatch.setattr("crazyem.diagnosis.naming.other_likelihoods.find_gusts", lambda data, point: air)
+    where = Finding("attitude", "y", "changes at 7 s", "time", (7.0, 28.0), 0.04, 0.005, "rad", nats, 1e-7)
+    remains = Unexplained((where,) if nats else (), 0.0)
+    (named,) = judged(Data(()), start_point(load_vehicle("cf2")), "gusts", remains)
+    return named
+
+
 def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(monkeypatch):
     """At the longest memory that is tried the likelihood bends so little that the error of its logarithm is huge."""
-    found = Gusts(5000.0, np.ones(3), 4.0, 3e4, True, 1.6, 0.05)
-    monkeypatch.setattr("crazyem.diagnosis.naming.other_likelihoods.find_gusts", lambda data, point: found)
-    vehicle, remains = load_vehicle("cf2"), Unexplained((), 0.0)
-    data, point = Data(()), Point(vehicle, {}, start_noise())
-    (named,) = other_likelihoods(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
+    named = gusts_named(monkeypatch, memory=4.0, unsure=3e4)
     assert named.parameters["correlation_time"].ci95 == (0.01, 100.0)
     assert named.parameters["standard_deviation"].ci95 == pytest.approx((1.502, 1.698))
 
@@ -173,12 +181,7 @@ def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(m
 )
 def test_gusts_are_as_sure_as_what_they_leave_allows(monkeypatch, nats, confidence):
     """A gain of 5000 nats is 2.94 times what is left: 0.49 by the rule for imitations."""
-    air = Gusts(5000.0, np.ones(3), 0.25, 0.1, True, 1.6, 0.05)
-    monkeypatch.setattr("crazyem.diagnosis.naming.other_likelihoods.find_gusts", lambda data, point: air)
-    where = Finding("attitude", "y", "changes at 7 s", "time", (7.0, 28.0), 0.04, 0.005, "rad", nats, 1e-7)
-    remains = Unexplained((where,) if nats else (), 0.0)
-    data, point = Data(()), Point(load_vehicle("cf2"), {}, start_noise())
-    (named,) = other_likelihoods(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
+    named = gusts_named(monkeypatch, memory=0.25, unsure=0.1, nats=nats)
     assert named.confidence == pytest.approx(confidence, abs=1e-3)
 
 

@@ -1,14 +1,13 @@
 """A cable is no wind and no lift near the floor; wind stays wind. Flown by `closed_loop.py`."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
+from diagnosis_parts import DRAG, WIND, ZERO_TRIM
 
 from crazyem.diagnosis.diagnose import Diagnosis, diagnose
-from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.naming import place_rivals
@@ -20,8 +19,6 @@ from crazyem.physics.effects.external_force import FORCE_BY_PLACE, pulling
 from crazyem.vehicle import Vehicle
 
 AIR = ("wind", "ground_effect", "linear_drag")
-WIND = Candidate("wind", (), ("x", "y", "z"))
-DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
 BLOCKS = np.linspace(-1.0, 1.0, 20)
 
 
@@ -31,7 +28,7 @@ def test_the_force_is_a_constant_and_a_matrix_times_the_place() -> None:
     there = SimpleNamespace(size=1, position=np.array([[1.0, 2.0, 3.0]]))
     there.to_body = lambda world: np.einsum("nji,nj->ni", quarter, world)
     values = FORCE_BY_PLACE.complete({"x": 0.1, "z": -0.2, "xy": 0.01, "zz": -0.05}, {})
-    found = pulling(there, Body(0.03, np.eye(3), np.zeros(3)), **values)  # type: ignore[arg-type]
+    found = pulling(there, Body(0.03, np.eye(3), np.zeros(3)), **values)
     np.testing.assert_allclose(found.force, [[0.0, -(0.1 + 0.01 * 2.0), -0.2 - 0.05 * 3.0]], atol=1e-15)
     assert not found.torque.any()
 
@@ -76,7 +73,7 @@ def asked(
     bare = Point(vehicle, {}, start_noise())
     point = bare.with_effects({"wind": {"x": 1.0, "y": 0.0, "z": 0.0}, "linear_drag": {"x": 0.01, "y": 0.0, "z": 0.0}})
     steps = tuple(Step((), Trial(c, 50.0, 50.0, 1.0, 50.0)) for c in (WIND, DRAG))
-    selection = Selection(bare, point, steps, (WIND, DRAG), SimpleNamespace())  # type: ignore[arg-type]
+    selection = Selection(bare, point, steps, (WIND, DRAG), SimpleNamespace())
     scatter = unsteady * np.tile([-1.0, 1.0], 10)
 
     together = SimpleNamespace(block_loglik=lambda at: BLOCKS if "wind" in at.effects else BLOCKS + scatter)
@@ -91,7 +88,7 @@ def asked(
     monkeypatch.setattr(place_rivals, "refine_base", fitted)
     monkeypatch.setattr(place_rivals, "with_torque_memory_refit", lambda data, at: at)
     monkeypatch.setattr(place_rivals, "_finding", lambda data, found, nats: SimpleNamespace(nats=nats))
-    found, finding = place_rivals.by_place(data, None, selection)  # type: ignore[arg-type]
+    found, finding = place_rivals.by_place(data, None, selection)
     assert (finding is None) == (found is selection)
     assert finding is None or finding.nats == force - named - 9  # twelve parameters against three
     return found
@@ -119,10 +116,6 @@ def test_a_force_by_place_is_the_better_one_with_all_but_one_chance_in_twenty(
     assert found.accepted == ((WIND, DRAG) if kept else (DRAG,))
 
 
-def test_where_nothing_is_left_by_place_nothing_is_compared(monkeypatch) -> None:
-    assert asked(monkeypatch, named=100.0, force=150.0, left=20.0).accepted == (WIND, DRAG)
-
-
-def test_beside_a_trim_nothing_is_compared(monkeypatch) -> None:
-    trimmed = replace(DRONE, effects={"trim": {"x": 0.0, "y": 0.0, "z": 0.0}})
-    assert asked(monkeypatch, named=100.0, force=150.0, vehicle=trimmed).accepted == (WIND, DRAG)
+@pytest.mark.parametrize("more", [{"left": 20.0}, {"vehicle": ZERO_TRIM}], ids=["little is left by place", "a trim"])
+def test_where_nothing_is_left_by_place_and_beside_a_trim_nothing_is_compared(monkeypatch, more):
+    assert asked(monkeypatch, named=100.0, force=150.0, **more).accepted == (WIND, DRAG)

@@ -62,7 +62,7 @@ def assert_close(found: Array, truth: Array, *, position: float, rest: float) ->
 
 
 def predicted(recording: Recording, vehicle: Vehicle = DRONE, **options: Any) -> Any:
-    """By the model alone; what a prediction learns in flight is tested in `test_diagnosis_earned.py`."""
+    """By the model alone; what a prediction learns in flight is tested in `test_diagnosis_bias_correction.py`."""
     return predict(recorded(recording, vehicle), **{"horizon": 50, "plain": True, **options})
 
 

@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 from closed_loop import DRONE, SIGNS, fly
+from diagnosis_parts import data_of, nominal_of, start_point
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.fit import nominal
 from crazyem.diagnosis.fitting.model import Noise, Point
-from crazyem.diagnosis.fitting.noise import start_noise
-from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.random_torques import (
     amplitude_of,
     block_covariances,
@@ -44,7 +43,6 @@ def test_a_rotor_that_disturbs_is_told_by_the_signs_of_its_place(rotor: int) -> 
     rng = np.random.default_rng(rotor)
     rates = rng.normal(size=(ROWS, 3)) + 0.35 * rng.normal(size=(ROWS, 1)) * SIGNS[:, rotor]
     found = erratic_rotor([model_of(rates)], POINT)
-    assert found is not None
     assert (found.signal, found.regime, found.variable) == ("torque", f"rotor {rotor + 1} at random", "at random")
     assert found.effect_size > 0
 
@@ -73,7 +71,6 @@ def test_the_trim_of_another_day_is_no_random_torque(rotor: int) -> None:
     assert erratic_rotor([model_of(first), model_of(second + steady)], POINT) is None
     erratic = 0.35 * np.random.default_rng(9).normal(size=(ROWS, 1)) * SIGNS[:, rotor]
     found = erratic_rotor([model_of(first + erratic), model_of(second + erratic - steady)], POINT)
-    assert found is not None
     assert found.regime == f"rotor {rotor + 1} at random"
 
 
@@ -110,8 +107,7 @@ def test_noise_has_no_hump() -> None:
 @pytest.mark.slow
 def test_a_flight_that_shakes() -> None:
     """3 rad/s^2 in roll and pitch about 6 Hz: found there with its torque."""
-    data = Data([flight_of(fly(vibration=3.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, start_noise()))
+    data, point = nominal_of(fly(vibration=3.0))
     found = humps(data.models[0], point)
     assert {f.axis for f in found} == {"x", "y"}
     for f, inertia in zip(sorted(found, key=lambda f: f.axis), DRONE.inertia, strict=False):
@@ -121,8 +117,7 @@ def test_a_flight_that_shakes() -> None:
 
 
 def test_a_healthy_made_flight_has_neither() -> None:
-    data = Data([flight_of(fly(seconds=7.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, start_noise()))
+    data, point = nominal_of(fly(seconds=7.0))
     assert not humps(data.models[0], point)
     assert erratic_rotor(data.models, point) is None
 
@@ -146,8 +141,7 @@ def test_torques_that_products_of_inertia_turn_into_rates_are_no_rotor(share: fl
 
 def test_what_a_filter_remembers_is_an_innovation_again() -> None:
     """Torques with a memory hide how the axes go together: most of it is foreseen. Without, noise takes their place."""
-    data = Data([flight_of(fly(seconds=7.0, sway=6.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, start_noise()))
+    data, point = nominal_of(fly(seconds=7.0, sway=6.0))
     assert point.noise.disturbance[3:].max() > 1.0
     quiet = memoryless(data.twin(), point)
     assert not quiet.noise.disturbance[3:].any()
@@ -157,10 +151,9 @@ def test_what_a_filter_remembers_is_an_innovation_again() -> None:
 
 def test_a_made_rotor_that_pushes_at_random_is_told() -> None:
     """By 4 mN with a memory of 0.05 s, for a roll of 4 mN times the arm: which rotor, and about how much."""
-    data = Data([flight_of(fly(sticking=4e-3, seconds=14.0), DRONE)])
-    quiet = memoryless(data, nominal(data, Point(DRONE, {}, start_noise())))
+    data = data_of(fly(sticking=4e-3, seconds=14.0))
+    quiet = memoryless(data, nominal(data, start_point()))
     data.settle(quiet)
     found = erratic_rotor(data.models, quiet)
-    assert found is not None
     assert found.regime == "rotor 4 at random"
     assert 0.5 < found.effect_size / (4e-3 * DRONE.arm[0]) < 1.5

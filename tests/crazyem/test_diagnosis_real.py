@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_flight import array_of
+from made_flight import array_of, changed
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
@@ -72,17 +72,12 @@ def test_the_delay_of_rotor_speeds_is_found_whatever_its_sign(delay: float, seed
     assert alignment.running[-1] == pytest.approx(delay, abs=2e-3)
 
 
-def spoilt(recording: Recording, name: str, value: NDArray) -> Recording:
-    array = recording.signals[name]
-    return replace(recording, signals={**recording.signals, name: replace(array, value=value)})
-
-
 def test_speeds_that_no_rotor_has_are_errors_of_transmission() -> None:
     """One sample of a million rpm is 400 N, and outweighs the flight."""
     sound = shaken(delay=0.02)
     speed = sound.signals["rotor_speed"].value.copy()
     speed[700, 3], speed[900, 0] = 104720.0, 33036.0
-    spoiled = spoilt(sound, "rotor_speed", speed)
+    spoiled = changed(sound, "rotor_speed", value=speed)
     used = inputs_of(spoiled, VEHICLE).rotor
     assert used.time.size == inputs_of(sound, VEHICLE).rotor.time.size - 2
     assert used.thrust.max() < 1.0
@@ -96,7 +91,7 @@ def test_a_blow_is_no_answer_to_the_rotors() -> None:
     rate = sound.signals["body_rate"].value.copy()
     for begin in (-120, -111, -102):
         rate[begin : begin + 4, :2] += np.array([[-16.0, 13.0], [32.0, 27.0], [-11.0, 2.0], [0.0, -7.0]])
-    hit = found(spoilt(sound, "body_rate", rate))
+    hit = found(changed(sound, "body_rate", value=rate))
     assert hit.delay == pytest.approx(found(sound).delay, abs=5e-4)
     assert hit.running[-1] == pytest.approx(hit.delay, abs=2e-3)
 
@@ -126,8 +121,7 @@ def test_a_prediction_knows_of_the_delay_what_came_before_its_start() -> None:
     first = shaken(delay=0.03)
     late = first.signals["rotor_speed"]
     other = shaken(delay=-0.03, seed=1).signals["rotor_speed"].value
-    changed = np.where(late.time[:, None] > 10.0, other, late.value)
-    second = replace(first, signals={**first.signals, "rotor_speed": replace(late, value=changed)})
+    second = changed(first, "rotor_speed", value=np.where(late.time[:, None] > 10.0, other, late.value))
     one, two = (predict(recorded(r, VEHICLE), horizon=10) for r in (first, second))
     before = one.time[:, -1] < 9.9
     assert before.sum() > 500

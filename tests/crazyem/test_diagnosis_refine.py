@@ -1,24 +1,30 @@
-"""Where a fit ends: at the maximum that a plain search finds, the last step without a look at the likelihood there."""
+"""Where a fit ends: at the maximum that a plain search finds, or where the filter leaves the range of numbers."""
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
+from diagnosis_parts import DRAG, QUADRATIC_DRAG, data_of, silent
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from crazyem.diagnosis.fitting import fit
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.fitting.fit import Data, has_large_offset, refine
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, has_large_offset, refine
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Column, Point
 from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.naming.select import Basis, fitted_trial
+from crazyem.diagnosis.naming.trials import Trial
 from crazyem.diagnosis.settings import FITTING
+from crazyem.errors import DataError
 
-DRAG = Candidate("linear_drag", (), ("y",))
+ALONG_Y = Candidate("linear_drag", (), ("y",))
 Array = NDArray[np.float64]
 
 
@@ -78,7 +84,7 @@ def begun(data: Data) -> Point:
 def test_a_fit_ends_where_a_plain_search_does_and_a_second_one_looks_no_further():
     data = Counted([flight_of(fly(Hidden(drag=(0.0, 0.02, 0.0)), seconds=8.0, seed=4), DRONE)])
     point = begun(data)
-    found = refine(data, point, [DRAG], noise=False)
+    found = refine(data, point, [ALONG_Y], noise=False)
     value = found.point.effects["linear_drag"]["y"]
 
     def lost(y: float) -> float:
@@ -89,14 +95,14 @@ def test_a_fit_ends_where_a_plain_search_does_and_a_second_one_looks_no_further(
     assert value == pytest.approx(plain.x, abs=0.2 * sd)
     assert found.loglik == pytest.approx(-plain.fun, abs=FITTING.min_round_gain)
     data.looks = 0
-    again = refine(data, found.point, [DRAG], noise=False)
+    again = refine(data, found.point, [ALONG_Y], noise=False)
     assert data.looks == 1
     assert again.point.effects["linear_drag"]["y"] == pytest.approx(value, abs=0.1 * sd)
 
 
 def test_the_last_step_ends_where_a_fit_does_that_looks_at_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02)), seconds=8.0, seed=4), DRONE)
-    drag, found, looks = Candidate("linear_drag", (), ("x", "y", "z")), [], []
+    drag, found, looks = DRAG, [], []
     for least in (FITTING.min_round_gain, 1e-9):
         monkeypatch.setattr(fit, "FITTING", replace(FITTING, min_round_gain=least))
         data = Counted([flight])
@@ -133,7 +139,7 @@ def test_of_a_quadratic_the_last_step_is_exact(nats: float, looks: int) -> None:
 
 def test_a_large_offset_is_looked_at_after_passes_that_no_longer_change() -> None:
     """Velocities that are a third too large in the log: the first pass is far from the last."""
-    data = Data([flight_of(fly(seconds=6.0), DRONE)])
+    data = data_of(fly(seconds=6.0))
     point = begun(data).with_effects({"velocity_scale": dict.fromkeys("xyz", 1.3)})
     assert has_large_offset("velocity_scale", point.effects["velocity_scale"])
     columns = Candidate("velocity_scale", (), ("x", "y", "z")).columns(point)
@@ -153,6 +159,49 @@ def test_a_step_that_fails_is_tried_smaller_only_where_something_is_to_be_gained
     """The step is 0.1: of 1000 nats lost a third of it may be worth a look, of 0.03 not."""
     data = Falling(depth)
     point = Point(DRONE, {"linear_drag": {"x": 0.0, "y": 0.0, "z": 0.0}}, start_noise())
-    found = refine(data, point, [DRAG], noise=False)
+    found = refine(data, point, [ALONG_Y], noise=False)
     assert data.asked == pytest.approx([0.0, *(0.1 / 3**k for k in range(tries))])
     assert found.point.effects["linear_drag"]["y"] == 0.0
+
+
+# -- where the filter leaves the range of numbers ----------------------------------------------------------------------
+
+
+@pytest.fixture
+def wild() -> tuple[Data, Point]:
+    """A model whose drag, against a wind that no air has, is beyond all numbers."""
+    data = data_of(fly(seconds=5.0))
+    effects = {"quadratic_drag": {"x": 1e200, "y": 1e200, "z": 1e200}}
+    return data, Point(DRONE, effects, start_noise())
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_it_is_a_sentence_and_no_traceback(wild: tuple[Data, Point]) -> None:
+    data, point = wild
+    with pytest.raises(DataError, match="leaves the range of numbers"):
+        refine(data, point, [QUADRATIC_DRAG])
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_the_next_model_is_not_spoiled(wild: tuple[Data, Point]) -> None:
+    data, point = wild
+    sound = Point(DRONE, {}, point.noise)
+    before = data.loglik(sound, passes=3)
+    assert not np.isfinite(data.loglik(point))
+    assert data.loglik(sound, passes=3) == pytest.approx(before, abs=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_a_candidate_that_diverges_is_no_explanation(wild: tuple[Data, Point], monkeypatch: pytest.MonkeyPatch) -> None:
+    data, point = wild
+
+    def diverges(*arguments: object, **more: object) -> None:
+        raise DivergedError("too far")
+
+    monkeypatch.setattr("crazyem.diagnosis.naming.select.refine_base", diverges)
+    basis = Basis(data, None, Point(DRONE, {}, point.noise), (), 0.0, 0.0)
+    linear = Trial(QUADRATIC_DRAG, 50.0, 50.0, 1.0, 49.0)
+    solution: Any = SimpleNamespace(theta=np.array([0.1, 0.1, 0.1]))
+    found = fitted_trial(basis, linear, solution, say=silent)
+    assert found is linear
+    assert not found.admissible

@@ -2,7 +2,6 @@
 
 import base64
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from html_pages import Page
 from hypothesis import given
 from hypothesis import strategies as st
 from made_diagnosis import document, pictures
@@ -27,44 +27,14 @@ from crazyem.diagnosis.report.verdict import claim, verdict
 from crazyem.errors import UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE
 
-VOID = {"meta", "img", "br", "line"}
 HOSTILE = "<script>alert('x')</script>\x1b[31m & \"quoted\" $\\frac{1}"
 
 
-class Checked(HTMLParser):
-    """Collects text and sources; fails on tags that do not match, on scripts, and on anything from elsewhere."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.text: list[str] = []
-        self.images: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        assert tag not in ("script", "link", "iframe", "object", "base")
-        for name, value in attrs:
-            assert not name.startswith("on")
-            if name in ("src", "href"):
-                assert (value or "").startswith("data:image/svg+xml;base64,")
-                self.images.append(value or "")
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        if tag not in VOID:
-            assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if self.open and self.open[-1] != "style":
-            self.text.append(data)
-
-
-def checked(text: str) -> tuple[str, list[str]]:
-    parser = Checked()
-    parser.feed(text)
-    parser.close()
-    assert parser.open == []
-    return " ".join(" ".join(parser.text).split()), parser.images
+def checked(text):
+    """The words of a page and its pictures, which are part of it."""
+    page = Page(text)
+    assert all(link.startswith("data:image/svg+xml;base64,") for link in page.links)
+    return " ".join(page.words), page.links
 
 
 def test_a_report_says_everything_that_the_document_has(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from closed_loop import DRONE, fly
-from made_flight import array_of
+from made_flight import array_of, changed
 from scipy.special import expit
 
 from crazyem.diagnosis import diagnose as diagnosing
@@ -89,7 +89,6 @@ def test_lag_and_delay_are_those_of_the_rotors(flown, lag, late):
 @pytest.mark.parametrize("seed", [1, 2])
 def test_noise_of_speeds_does_not_make_rotors_look_quick(flown, seed):
     found = response(answers([answering(flown, 0.05, 0.0, seed=seed, noise=0.01)], ROTORS))
-    assert found is not None
     assert found.lag == pytest.approx(0.05, rel=0.06)
 
 
@@ -97,7 +96,6 @@ def test_noise_of_speeds_does_not_make_rotors_look_quick(flown, seed):
 def test_a_voltage_that_drops_under_the_load_does_not_make_rotors_look_quick(flown, lag):
     made = answering(flown, lag, 0.0, seed=1, drop=12.0)  # a hover takes a quarter of the voltage
     found = response(answers([made], ROTORS))
-    assert found is not None
     assert found.lag == pytest.approx(lag, rel=0.06)
     assert found.delay == pytest.approx(0.0, abs=2e-3)
 
@@ -107,7 +105,6 @@ def test_without_a_voltage_a_rotor_that_sticks_is_found_and_no_lag(flown):
     bare = [replace(m, signals={n: a for n, a in m.signals.items() if n != "voltage"}) for m in made]
     assert response(answers(bare, ROTORS)) is None
     sticking = unresponsive_rotor(answers(bare, ROTORS))
-    assert sticking is not None
     assert sticking.regime == "rotor 2 does not follow its command"
 
 
@@ -116,39 +113,41 @@ def test_what_does_not_answer_says_nothing(flown):
     made = answering(flown, 0.03, 0.0)
     assert response(answers([made], DRONE)) is None  # no rotor constant
     other = answering(flown, 0.03, 0.0, seed=1)
-    strange = replace(made, signals={**made.signals, "rotor_speed": other.signals["rotor_speed"]})
-    assert response(answers([strange], ROTORS)) is None
-    held = made.signals["rotor_speed"]
-    stuck = array_of("rotor_speed", held.time, np.full_like(held.value, 2000.0), place=90)
-    assert response(answers([replace(made, signals={**made.signals, "rotor_speed": stuck})], ROTORS)) is None
+    strange = other.signals["rotor_speed"].value
+    for speed in (strange, np.full_like(strange, 2000.0)):  # of another flight, and stuck
+        assert response(answers([changed(made, "rotor_speed", value=speed)], ROTORS)) is None
 
 
-def found(lag: float, delay: float, sd: float = 1.4e-3) -> Response:
+def found(lag, delay, sd=1.4e-3):
     return Response(lag, delay, np.diag([sd**2, ROTOR_RESPONSE.delay_sd**2]))
 
 
-def test_a_lag_or_a_delay_or_both_are_named():
-    assert late_response(found(0.031, 0.0005), None, ROTORS) is None
-    slow = late_response(found(0.045, 0.0), found(0.044, 0.001), ROTORS)
-    assert slow is not None
-    assert slow.values == {"motor_lag": (pytest.approx(0.045), pytest.approx(1.4e-3))}
-    assert slow.nats == pytest.approx(0.5 * (0.015 / 1.4e-3) ** 2)
-    late = late_response(found(0.03, 6.0 * ROTOR_RESPONSE.delay_sd), None, ROTORS)
-    assert late is not None
-    assert list(late.values) == ["input_delay"]
-    both = late_response(found(0.045, 6.0 * ROTOR_RESPONSE.delay_sd), None, ROTORS)
-    assert both is not None
-    assert set(both.values) == {"motor_lag", "input_delay"}
-    # no rotor answers before it is told to
-    assert late_response(found(0.03, -6.0 * ROTOR_RESPONSE.delay_sd), None, ROTORS) is None
+FAR = 6.0 * ROTOR_RESPONSE.delay_sd
 
 
-def test_flights_held_out_must_agree():
-    assert late_response(found(0.045, 0.0), found(0.03, 0.0), ROTORS) is None
-    assert late_response(found(0.06, 0.0), found(0.05, 0.0), ROTORS) is None  # nearer than the file, not near
-    agreed = late_response(found(0.045, 0.0), found(0.045, 0.0), ROTORS)
-    assert agreed is not None
-    assert agreed.held_out > SELECTION.min_evidence
+@pytest.mark.parametrize(
+    ("here", "apart", "named"),
+    [
+        ((0.031, 0.0005), None, None),
+        ((0.045, 0.0), (0.044, 0.001), ["motor_lag"]),
+        ((0.03, FAR), None, ["input_delay"]),
+        ((0.045, FAR), None, ["motor_lag", "input_delay"]),
+        ((0.03, -FAR), None, None),  # no rotor answers before it is told to
+        ((0.044, -0.006), None, ["motor_lag"]),  # slow and seemingly early is slow
+        ((0.045, 0.0), (0.03, 0.0), None),  # flights held out must agree
+        ((0.06, 0.0), (0.05, 0.0), None),  # nearer than the file, not near
+        ((0.045, 0.0), (0.045, 0.0), ["motor_lag"]),
+    ],
+)
+def test_a_lag_or_a_delay_or_both_are_named(here, apart, named):
+    said = late_response(found(*here), apart and found(*apart), ROTORS)
+    assert (said and list(said.values)) == named
+    assert not (said and said.alike)
+    if named == ["motor_lag"]:
+        lag = here[0]
+        assert said.values["motor_lag"] == (pytest.approx(lag), pytest.approx(1.4e-3))
+        assert here[1] or said.nats == pytest.approx(0.5 * ((lag - 0.03) / 1.4e-3) ** 2)
+        assert here != apart or said.held_out > SELECTION.min_evidence
 
 
 def test_where_one_is_as_good_as_the_other_both_are_said():
@@ -157,38 +156,26 @@ def test_where_one_is_as_good_as_the_other_both_are_said():
     sd = np.array([1.5e-3, 1e-3])
     response = Response(0.0345, 0.003, np.outer(sd, sd) * [[1.0, -0.5], [-0.5, 1.0]])
     said = late_response(response, None, ROTORS)
-    assert said is not None
     assert said.alike
     assert list(said.values) == ["motor_lag"]
     assert said.values["motor_lag"][0] == pytest.approx(0.03 + 1.5 * 4.5e-3)  # 3 + 3/2 deviations: the delay's share
     assert said.nats == pytest.approx(18.0 - 4.5)
 
 
-def test_rotors_slow_and_seemingly_early_are_slow():
-    """A lag 10 deviations up and a delay below nothing: the lag is named alone."""
-    said = late_response(found(0.044, -0.006), None, ROTORS)
-    assert said is not None
-    assert list(said.values) == ["motor_lag"]
-    assert not said.alike
-
-
 def test_wild_and_slow_samples_are_refused(flown):
     made = answering(flown, 0.03, 0.0)
-    speed, command = made.signals["rotor_speed"], made.signals["motor_command"]
-    wild = array_of("rotor_speed", speed.time, np.where(np.arange(speed.time.size)[:, None] % 50, speed.value, 1e300),
-                    place=91)  # fmt: skip
-    sound = response(answers([replace(made, signals={**made.signals, "rotor_speed": wild})], ROTORS))
-    assert sound is not None
+    speed, command = made.signals["rotor_speed"].value, made.signals["motor_command"]
+    wild = np.where(np.arange(len(speed))[:, None] % 50, speed, 1e300)
+    sound = response(answers([changed(made, "rotor_speed", value=wild)], ROTORS))
     assert sound.lag == pytest.approx(0.03, rel=0.06)
-    slow = array_of("motor_command", 300.0 * command.time, command.value, place=92)
-    assert response(answers([replace(made, signals={**made.signals, "motor_command": slow})], ROTORS)) is None
+    slow = changed(made, "motor_command", time=300.0 * command.time)
+    assert response(answers([slow], ROTORS)) is None
 
 
 @pytest.mark.parametrize("rotor", [1, 4])
 def test_a_rotor_that_sticks_is_told_by_what_it_leaves_of_its_command(flown, rotor):
     sticking = [answering(flown, 0.03, 0.0, seed=s, sticks={rotor: 0.1}) for s in (0, 1)]
     told = unresponsive_rotor(answers(sticking, ROTORS))
-    assert told is not None
     assert told.regime == f"rotor {rotor} does not follow its command"
     assert (told.signal, told.axis, told.unit, told.variable) == ("force", "z", "N", "rotor")
     most = (0.06 + 2 * 0.08 * 0.5) * 0.1 / np.sqrt(3)  # N: errors within the band, were all as likely

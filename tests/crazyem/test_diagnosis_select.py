@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
+from diagnosis_parts import DRAG, INERTIA, LAG, TORQUE, WIND, data_of, nominal_of, rotor, silent, start_point
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, with_torque_memory, with_torque_memory_refit
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import held_out_fit, held_out_twin, nuisances, refine_base, with_nuisances
-from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.random_torques import peaks
 from crazyem.diagnosis.naming import onset, prune
 from crazyem.diagnosis.naming import select as selecting
 from crazyem.diagnosis.naming.evidence import joint_gain
-from crazyem.diagnosis.naming.onset import ONSET, date
+from crazyem.diagnosis.naming.onset import ONSET, date, onset_of
 from crazyem.diagnosis.naming.select import (
     Basis,
     compared,
@@ -38,8 +38,8 @@ ONSET_TIME = 4.37  # s
 @pytest.fixture(scope="module")
 def failing() -> tuple[Data, Point]:
     """A rotor loses a tenth in flight, and the nominal model of it."""
-    data = Data([flight_of(fly(Hidden(thrust=(1, 1, 0.9, 1), onset=ONSET_TIME), seconds=8.0), DRONE)])
-    return data, nominal(data, Point(DRONE, {}, start_noise()))
+    data = data_of(fly(Hidden(thrust=(1, 1, 0.9, 1), onset=ONSET_TIME), seconds=8.0))
+    return data, nominal(data, start_point())
 
 
 def test_a_failure_hides_its_moment_in_the_noise_until_it_is_fitted_again(failing: tuple[Data, Point]) -> None:
@@ -60,7 +60,7 @@ def test_a_failure_hides_its_moment_in_the_noise_until_it_is_fitted_again(failin
 def test_where_a_trim_is_known_only_what_sets_in_later_is_asked_of_rotors() -> None:
     """What is steady the balance tells (`steady_odds.py`)."""
     trimmed = replace(DRONE, effects={"trim": {"x": 1e-4, "y": -2e-4, "z": 3e-4}})
-    data = Data([flight_of(fly(Hidden(thrust=(1, 1, 0.9, 1), onset=ONSET_TIME), seconds=8.0), trimmed)])
+    data = data_of(fly(Hidden(thrust=(1, 1, 0.9, 1), onset=ONSET_TIME), seconds=8.0), vehicle=trimmed)
     point = nominal(data, Point(trimmed, {n: dict(v) for n, v in trimmed.effects.items()}, start_noise()))
     candidates = [Candidate("rotor_fault", (("rotor", r), (ONSET, None)), ("scale",)) for r in (1, 2, 3, 4)]
     asked = [t.candidate for t, _ in linear_trials(data, point, (), candidates)]
@@ -70,15 +70,15 @@ def test_where_a_trim_is_known_only_what_sets_in_later_is_asked_of_rotors() -> N
 
 def test_an_effect_from_the_start_is_not_dated(failing: tuple[Data, Point]) -> None:
     data, point = failing
-    candidate = Candidate("torque_scale", (), ("scale",))
-    fitted = Fitted(point, (candidate,), 0.0, None, np.zeros(0))  # type: ignore[arg-type]
+    candidate = TORQUE
+    fitted = Fitted(point, (candidate,), 0.0, None, np.zeros(0))
     assert date(data, fitted, candidate) == (fitted, candidate)
 
 
 def test_noise_is_chosen_anew_as_for_a_flight_seen_first() -> None:
-    data = Data([flight_of(fly(seconds=5.0), DRONE)])
-    data.settle(Point(DRONE, {}, start_noise()))
-    white = data.fit_noise(Point(DRONE, {}, start_noise()))
+    data = data_of(fly(seconds=5.0))
+    data.settle(start_point())
+    white = data.fit_noise(start_point())
     first = with_torque_memory(data, white)
     again = with_torque_memory_refit(data, first)
     assert again.noise.memory == first.noise.memory
@@ -89,10 +89,10 @@ def test_noise_is_chosen_anew_as_for_a_flight_seen_first() -> None:
 @pytest.mark.parametrize("torque", [0.8, 0.74, 0.66])  # of the flight held out; with the last there is a bound
 def test_what_an_effect_would_gain_fitted_to_both_flights_is_the_top_of_their_likelihood(torque: float) -> None:
     """Against the likelihood of both at a number of sizes, what is always free fitted to each flight alone."""
-    candidate = Candidate("torque_scale", (), ("scale",))
+    candidate = TORQUE
     flown = fly(Hidden(torque=0.8), seconds=5, seed=5), fly(Hidden(torque=torque), seconds=10, seed=15)
-    data, apart = (Data([flight_of(f, DRONE)]) for f in flown)
-    point = nominal(data, Point(DRONE, {}, start_noise()))
+    data, apart = (data_of(f) for f in flown)
+    point = nominal(data, start_point())
     begun = point.with_effects({"torque_scale": {"scale": 0.95}})
     fitted = refine_base(data, begun, [candidate], noise=False)
     here = fitted.point.effects["torque_scale"]["scale"]
@@ -108,9 +108,9 @@ def test_what_an_effect_would_gain_fitted_to_both_flights_is_the_top_of_their_li
 
 def test_noise_belongs_to_a_flight_and_does_not_decide_between_two_names() -> None:
     """One explanation under two noises, as two fits end with: on flights held out it is one."""
-    candidate = Candidate("torque_scale", (), ("scale",))
-    data, apart = (Data([flight_of(fly(Hidden(torque=0.8), seconds=6, seed=seed), DRONE)]) for seed in (5, 7))
-    point = nominal(data, Point(DRONE, {}, start_noise()))
+    candidate = TORQUE
+    data, apart = (data_of(fly(Hidden(torque=0.8), seconds=6, seed=seed)) for seed in (5, 7))
+    point = nominal(data, start_point())
     begun = point.with_effects({"torque_scale": {"scale": 0.9}})
     fitted = refine_base(data, begun, [candidate], rounds=3)
     noise = fitted.point.noise
@@ -128,9 +128,8 @@ def test_noise_belongs_to_a_flight_and_does_not_decide_between_two_names() -> No
 
 
 def test_a_fitted_trial_is_admissible_from_its_detection_limit_on_and_blocks_of_its_flight_confirm_nothing() -> None:
-    candidate = Candidate("torque_scale", (), ("scale",))
-    data = Data([flight_of(fly(Hidden(torque=0.8), seconds=5), DRONE)])
-    point = nominal(data, Point(DRONE, {}, start_noise()))
+    candidate = TORQUE
+    data, point = nominal_of(fly(Hidden(torque=0.8), seconds=5))
     fitted = refine_base(data, point.with_effects({"torque_scale": {"scale": 0.9}}), [candidate], noise=False)
     small = replace(fitted, point=fitted.point.with_effects({"torque_scale": {"scale": 0.999}}))
     basis, linear = Basis(data, None, point, (), 0.0, 0.0), Trial(candidate, 40.0, 33.0, 1.0, 39.0)
@@ -138,10 +137,6 @@ def test_a_fitted_trial_is_admissible_from_its_detection_limit_on_and_blocks_of_
         found = compared(basis, linear, data, fit)
         assert found.admissible is admissible
         assert (found.held_out, found.expected) == (33.0, 0.0)
-
-
-INERTIA = Candidate("inertia", (), ("xx", "yy", "zz"))
-LAG = Candidate("motor_lag", (), ("time_constant",))
 
 
 @pytest.mark.parametrize(
@@ -166,15 +161,14 @@ def test_the_best_is_taken_if_it_exceeds_its_limit_and_has_eight_nats(
     monkeypatch.setattr(selecting, "fitted_trial", lambda basis, trial, solution, *, say: trial)
     data: Any = SimpleNamespace(workers=Workers(1))
     apart: Any = SimpleNamespace() if held_out else None
-    basis = Basis(data, apart, Point(DRONE, {}, start_noise()), (), 0.0, 0.0)
+    basis = Basis(data, apart, start_point(), (), 0.0, 0.0)
     linear: Any = [(best, None), (Trial(INERTIA, 1.0, 0.0, 1.0, -2.0), None)]
-    step = step_of(basis, linear, say=lambda text: None)
+    step = step_of(basis, linear, say=silent)
     assert (step.taken and step.taken.candidate) == (LAG if taken else None)
     assert [t.candidate for t in step.trials] == [LAG, INERTIA]
     assert step.alike == ()
 
 
-WIND, DRAG = Candidate("wind", (), ("x",)), Candidate("linear_drag", (), ("x",))
 # Nats of sets of effects on fitted and on held-out flights. A drag and a lag are real. A wind takes up both on the
 # fitted flights, but not on the others, and beside it the lag brings nothing.
 HIDING = {
@@ -237,7 +231,7 @@ def test_after_a_wrong_effect_is_left_out_what_it_had_hidden_is_found(
     monkeypatch.setattr(prune, "dispersion_of", lambda fitted, count, *, offset: 1.0)
     data: Any = SimpleNamespace(workers=Workers(1), loglik=lambda point, passes: nats(point)[0])
     apart: Any = SimpleNamespace()
-    point = Point(DRONE, {}, start_noise())
+    point = start_point()
     begun = Selection(point, point, (), (), fit(data, point, ()), before)
     said: list[str] = []
     found = select(data, point, [LAG, DRAG, WIND], held_out=apart, begun=begun if before else None, say=said.append)
@@ -270,8 +264,7 @@ def test_after_a_wrong_effect_is_left_out_what_it_had_hidden_is_found(
 @pytest.mark.parametrize("lag", [0.08, 0.1])
 def test_a_lag_that_makes_its_loop_swing_is_as_long_as_it_is(lag: float) -> None:
     """Twice as slow as the file says, and more: humps at 2 Hz, and nothing that vibrates."""
-    data = Data([flight_of(fly(vehicle=replace(DRONE, motor_time_constant=lag), seconds=20.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, start_noise()))
+    data, point = nominal_of(fly(vehicle=replace(DRONE, motor_time_constant=lag), seconds=20.0))
     assert peaks(data.models[0], point)
     fitted = refine_base(data, point.with_effects({"motor_lag": LAG.neutral(point)}), [LAG], rounds=3)
     assert fitted.point.effects["motor_lag"]["time_constant"] == pytest.approx(lag, rel=0.1)
@@ -280,9 +273,9 @@ def test_a_lag_that_makes_its_loop_swing_is_as_long_as_it_is(lag: float) -> None
 def test_noise_stays_where_a_file_has_a_trim() -> None:
     vehicle = replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}})
     point = Point(vehicle, dict(vehicle.effects), start_noise())
-    data = Data([flight_of(fly(seconds=5.0), DRONE)])
+    data = data_of(fly(seconds=5.0))
     assert same_noise(held_out_twin(data, point, ()), point)
-    plain = Point(DRONE, {}, start_noise())
+    plain = start_point()
     assert not same_noise(held_out_twin(data, plain, ()), plain)
     assert data.own is None
 
@@ -310,14 +303,14 @@ def test_the_search_goes_on_only_if_an_effect_that_is_gone_may_have_hidden_anoth
 def test_rivals_of_an_effect_that_is_a_nuisance_too_are_tried_without_this_nuisance() -> None:
     """A drag of 0.05 N s/m, with a file of one drone, in which a usual drag is free: a quadratic one explains most."""
     vehicle = replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}})
-    data = Data([flight_of(fly(Hidden(drag=(0.05, 0.05, 0.05)), seconds=8.0), vehicle)])
+    data = data_of(fly(Hidden(drag=(0.05, 0.05, 0.05)), seconds=8.0), vehicle=vehicle)
     point = nominal(data, Point(vehicle, dict(vehicle.effects), start_noise()))
     fitted = refine_base(data, point, ())
     basis = Basis(data, None, fitted.point, (), fitted.loglik, 0.0)
     asked = [Candidate(name, (), ("x", "y", "z")) for name in ("linear_drag", "quadratic_drag")]
     linear = linear_trials(data, fitted.point, (), asked)
-    alone = {t.candidate.effect: t for t in step_of(basis, linear, say=lambda text: None).trials}
-    step = constrained_step(basis, linear, asked, say=lambda text: None)
+    alone = {t.candidate.effect: t for t in step_of(basis, linear, say=silent).trials}
+    step = constrained_step(basis, linear, asked, say=silent)
     found = {t.candidate.effect: t for t in step.trials}
     assert step.taken is found["linear_drag"]
     assert {t.constrained for t in found.values()} == {frozenset({"linear_drag"})}
@@ -327,9 +320,9 @@ def test_rivals_of_an_effect_that_is_a_nuisance_too_are_tried_without_this_nuisa
 
 def test_a_candidate_in_the_place_of_another_is_fitted_where_the_other_is_neutral() -> None:
     """By the linear approximation: there the likelihood has no slope, to what two passes of the filter differ by."""
-    data = Data([flight_of(fly(Hidden(torque=0.8), seconds=6.0), DRONE)])
-    scale, wind = Candidate("torque_scale", (), ("scale",)), Candidate("wind", (), ("x", "y", "z"))
-    point = nominal(data, Point(DRONE, {}, start_noise())).with_effects({"torque_scale": {"scale": 0.8}})
+    data = data_of(fly(Hidden(torque=0.8), seconds=6.0))
+    scale, wind = TORQUE, WIND
+    point = nominal(data, start_point()).with_effects({"torque_scale": {"scale": 0.8}})
     data.settle(point)
     ((_, solution),) = linear_trials(data, point, (scale,), [wind], instead_of=scale)
     free = nuisances(data, point, (scale,))
@@ -338,3 +331,22 @@ def test_a_candidate_in_the_place_of_another_is_fitted_where_the_other_is_neutra
     score, information = data.gram(at, columns).total(range(len(columns)))
     assert solution.theta[0] == pytest.approx(0.2)
     np.testing.assert_allclose((score - information @ solution.theta)[-3:], 0.0, atol=1e-3 * np.abs(score[-3:]).max())
+
+
+# -- since when an effect is there -------------------------------------------------------------------------------------
+
+
+def onset_found(hidden: Hidden) -> Candidate | None:
+    data, point = nominal_of(fly(hidden, seconds=9.0, seed=5))
+    return onset_of(data, point, rotor(2), data.gram(point, rotor(2).columns(point)), [0])
+
+
+@pytest.mark.parametrize("onset", [5.3, 5.7, 5.9])
+def test_a_rotor_that_weakens_within_a_block(onset: float) -> None:
+    late = onset_found(Hidden(thrust=(1.0, 0.88, 1.0, 1.0), onset=onset))
+    assert dict(late.fixed)["rotor"] == 2
+    assert dict(late.fixed)[ONSET] == pytest.approx(onset, abs=0.1)
+
+
+def test_a_rotor_that_is_weak_from_the_start() -> None:
+    assert onset_found(Hidden(thrust=(1.0, 0.88, 1.0, 1.0))) is None

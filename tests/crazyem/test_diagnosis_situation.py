@@ -3,12 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from closed_loop import DRONE, fly
+from diagnosis_parts import start_point
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis.fitting.model import Model, Point, filter_corrections
+from crazyem.diagnosis.fitting.model import Model, Point, filter_corrections, under_relaxed
 from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.situation import (
     causal_middle,
@@ -87,7 +89,7 @@ def test_states_that_nothing_measured_since_a_restart_are_interpolated():
 def test_the_first_measurement_after_a_restart_is_no_force():
     """It moves the filter from a guess to the drone. Other corrections are those of a flight that has no restart."""
     whole, flight = restarting()
-    model, point = Model(flight), Point(DRONE, {}, start_noise())
+    model, point = Model(flight), start_point()
     impulse, _, known = filter_corrections(model.settle(point), flight)
     guessed = np.roll(unmeasured(flight).any(axis=1), 1) & ~flight.starts
     assert guessed.sum() > 20
@@ -95,7 +97,6 @@ def test_the_first_measurement_after_a_restart_is_no_force():
     assert not impulse[guessed].any()
     usual, _, _ = filter_corrections(Model(whole).settle(point), whole)
     assert np.abs(impulse[:, :3]).max() < 5.0 * np.abs(usual[:, :3]).max()
-    assert model.rows_path is not None
     assert np.abs(model.rows_path[:, :3] - whole.y[:, :3])[flight.starts].max() < 0.05  # m; without it as far as zero
 
 
@@ -160,3 +161,30 @@ def test_an_innovation_does_not_contain_its_own_measurements():
     change = np.abs(offsets(0.02) - offsets(0.0)).max(axis=1)
     assert change[at + 1 : at + 3].max() > 1e-4
     assert change[: at + 1].max() < 1e-9
+
+
+# -- where a velocity is shown far too large ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 1.3, 1.9, 3.0])
+@pytest.mark.parametrize("believed", [1.0, 0.7])
+def test_a_velocity_shown_too_large_is_found_in_few_passes(scale: float, believed: float) -> None:
+    """A filter that takes the offset of the pass before off what is shown, and believes that to a share."""
+    random = np.random.default_rng(1)
+    truth = random.normal(size=(200, 3))
+    shown = scale * truth
+    states = np.zeros((200, 19))
+    states[:, 3:6] = shown
+    for _ in range(12):
+        offset = np.zeros((200, 12))
+        offset[:, 3:6] = (scale - 1.0) * states[:, 3:6]
+        filtered = states.copy()
+        filtered[:, 3:6] = believed * (shown - offset[:, 3:6]) + (1.0 - believed) * truth
+        states = under_relaxed(filtered, states, offset)
+    assert states[:, 3:6] == pytest.approx(truth, abs=2e-3)
+
+
+def test_without_an_offset_of_velocity_nothing_is_kept() -> None:
+    filtered = np.ones((5, 19))
+    assert under_relaxed(filtered, np.zeros((5, 19)), np.zeros((5, 12))) is filtered
+    assert under_relaxed(filtered, None, np.ones((5, 12))) is filtered

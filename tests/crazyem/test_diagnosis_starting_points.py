@@ -9,14 +9,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
+from diagnosis_parts import THRUST, data_of, start_point
 from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.diagnosis.fitting.candidates import Candidate, variants
 from crazyem.diagnosis.fitting.divergence import diverges
-from crazyem.diagnosis.fitting.fit import Data, nominal
-from crazyem.diagnosis.fitting.model import Model, Point
-from crazyem.diagnosis.fitting.noise import start_noise
+from crazyem.diagnosis.fitting.fit import nominal
+from crazyem.diagnosis.fitting.model import Model
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import starting_points
@@ -28,7 +28,7 @@ from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 LOAD = CATALOGUE["suspended_load"]
-POINT = Point(DRONE, {}, start_noise())
+POINT = start_point()
 
 
 @given(st.lists(st.floats(0, 1e6), min_size=1, max_size=30))
@@ -50,9 +50,9 @@ def fitted(data, point, candidate):
 @pytest.mark.parametrize("length", [0.27, 0.5])  # at 0.15 m the plane pendulum itself is 5 % from the real one
 def test_a_load_is_begun_at_the_length_whose_swing_the_flight_shows(length):
     recording = fly(Hidden(load=(0.0015, length)), seconds=20.0, seed=3)
-    data = Data([flight_of(recording, DRONE)])
+    data = data_of(recording)
     point = refine_base(data, nominal(data, POINT), ()).point
-    candidates = [*variants(LOAD, point, data.signals), Candidate("thrust_scale", (), ("scale",))]
+    candidates = [*variants(LOAD, point, data.signals), THRUST]
     left = best_starting_points(data, point, (), candidates)
     assert candidates[-1] in left  # has one beginning only
     begun = left[:-1]
@@ -111,7 +111,7 @@ def test_what_is_begun_by_its_likelihood_is_tried_whatever_derivatives_say():
 
 @pytest.mark.parametrize("chaotic", [False, True])
 def test_where_a_flight_drives_loads_astray_the_likeliest_is_begun_with_alone(monkeypatch, chaotic):
-    data = Data([flight_of(fly(Hidden(load=(0.0015, 0.5)), seconds=10.0), DRONE)])
+    data = data_of(fly(Hidden(load=(0.0015, 0.5)), seconds=10.0))
     point = refine_base(data, nominal(data, POINT), ()).point
     data.models[0]._diverging["suspended_load"] = chaotic
     family = variants(LOAD, point, data.signals)

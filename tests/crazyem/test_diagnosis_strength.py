@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
+from diagnosis_parts import THRUST, start_point
 
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fitting.candidates import Candidate, OfRecordings, of_recordings
+from crazyem.diagnosis.fitting.candidates import OfRecordings, of_recordings
 from crazyem.diagnosis.fitting.days import THRUST_SD
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import OWN, Point, deviations, of_recording
@@ -30,8 +31,8 @@ def flights() -> list[Flight]:
 @pytest.mark.slow
 def test_each_is_found_and_the_mean_is_left_to_the_thrust_scale() -> None:
     data = Data(flights())
-    point = nominal(data, Point(DRONE, {}, start_noise()))
-    scale = Candidate("thrust_scale", (), ("scale",))
+    point = nominal(data, start_point())
+    scale = THRUST
     found = refine_base(data, point.with_effects({"thrust_scale": {"scale": 1.0}}), [scale]).point
     own = deviations(found.effects, "thrust_scale")
     away = np.array([own[f"{k}.csv"]["scale"] for k in range(4)])
@@ -44,9 +45,7 @@ def test_a_recording_hears_of_its_own_strength_only() -> None:
     """Derivatives by the strength of one recording, against differences of the log-likelihood of each."""
     data = Data(flights()[:3])
     own = of_recordings("thrust_scale", ("scale",), data.flights)
-    point = nominal(
-        data, Point(DRONE, {OWN + "thrust_scale": own.neutral(Point(DRONE, {}, start_noise()))}, start_noise())
-    )
+    point = nominal(data, Point(DRONE, {OWN + "thrust_scale": own.neutral(start_point())}, start_noise()))
     gram = data.gram(point, own.columns(point))
     score = np.stack([gram.score[gram.flight == k].sum(0) for k in range(3)])
     assert np.count_nonzero(score) == 3
@@ -83,7 +82,7 @@ def test_it_is_free_only_among_several_recordings_of_commands() -> None:
     trimmed = replace(DRONE, effects={"trim": {"x": 0.0}})
     assert not with_thrust_scales(some, [], trimmed)[0][0].differs
     data = Data(some)
-    free = {c.effect: (c, p) for c, p in nuisances(data, Point(DRONE, {}, start_noise()), ())}
+    free = {c.effect: (c, p) for c, p in nuisances(data, start_point(), ())}
     strengths, precisions = free[OWN + "thrust_scale"]
     assert isinstance(strengths, OfRecordings)
     assert strengths.free == ("0.csv/scale", "1.csv/scale", "2.csv/scale", "3.csv/scale")

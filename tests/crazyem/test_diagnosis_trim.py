@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
+from diagnosis_parts import DRAG, data_of, start_point
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -56,7 +57,7 @@ def test_an_effect_is_taken_back_to_the_file_and_not_to_nothing() -> None:
 
 
 def test_a_day_is_free_only_where_the_file_has_a_trim() -> None:
-    data = Data([flight_of(fly(seconds=6.0), DRONE)])
+    data = data_of(fly(seconds=6.0))
     for vehicle, there in ((DRONE, False), (TRIMMED, True)):
         free = {c.effect for c, _ in nuisances(data, point_of(vehicle), ())}
         assert ({TRIM, "thrust_scale", "velocity_moment"} <= free) is there
@@ -72,15 +73,13 @@ def test_a_trim_is_free_where_no_centre_of_mass_is_asked_for() -> None:
     """Rotors on the left weaker by 3 %, on the right stronger: thrust acts 3 % of the arm right of the middle."""
     lopsided = Hidden(thrust=(1.03, 1.03, 0.97, 0.97), drag=(0.02, 0.02, 0.0))
     flights = [replace(flight_of(fly(lopsided, seed=s, seconds=12.0), DRONE), coarse=True) for s in range(2)]
-    drag = Candidate("linear_drag", (), ("x", "y", "z"))
+    drag = DRAG
     for vehicle, there in ((DRONE, True), (replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}}), False)):
         free = {c.effect: p for c, p in nuisances(Data(flights), point_of(vehicle), ())}
         sd = np.array(free["center_of_mass"]) ** -0.5
         assert sd[:2] == pytest.approx(0.05 * DRONE.arm[0] if there else 2e-5)
     data = Data(flights)
-    start = nominal(data, Point(DRONE, {}, start_noise())).with_effects(
-        {"linear_drag": {"x": 0.01, "y": 0.01, "z": 0.0}}
-    )
+    start = nominal(data, start_point()).with_effects({"linear_drag": {"x": 0.01, "y": 0.01, "z": 0.0}})
     found = refine_base(data, start, [drag]).point.effects
     assert found["center_of_mass"]["y"] == pytest.approx(0.03 * DRONE.arm[1], rel=0.05)
     assert found["center_of_mass"]["x"] == pytest.approx(0.0, abs=1e-4)
@@ -175,7 +174,7 @@ def turned_file(vehicle: Vehicle, polar: NDArray) -> Vehicle:
 
 def odds(recording: Recording, vehicle: Vehicle) -> NDArray:
     """(4,) nats by which the balance prefers a fault of each rotor to none."""
-    data = Data([flight_of(recording, vehicle)])
+    data = data_of(recording, vehicle=vehicle)
     found = explanations([balance_of(data, nominal(data, replace(point_of(vehicle), noise=start_noise())))])
     return np.array([found["rotor", r][0] - found["", 0][0] for r in (1, 2, 3, 4)])
 
@@ -241,7 +240,6 @@ def test_healthy_flights_tell_a_smaller_cut(flown_by) -> None:
     """2.5 mm, by three healthy flights of other days; the rotor that is cut, and about as much as others say."""
     flights = [flown_by(f"motor__normal_flight__E8_log0{i}", 17.0) for i in (0, 1, 3)]
     vehicle = with_baseline(load_vehicle("cf2-legacy"), flights)
-    assert vehicle.days is not None
     assert vehicle.days.flights == 3
     damaged = flown_by("motor__cut_propeller_M3_2.5mm_2.5mm_42mm__E8_log00", 17.0)
     effect = next(e for e in diagnose([damaged], vehicle).effects if e.name == "rotor_fault")

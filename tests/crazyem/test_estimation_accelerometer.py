@@ -6,7 +6,7 @@ import reference
 import test_estimation_kernels as plain
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_estimation_kernels import INERTIA, MASS, R_FORCE, THETA, Q, R, filled_tape, scaled
+from test_estimation_kernels import INERTIA, MASS, R_FORCE, Q, R, filled_tape, scaled
 
 from crazyem.estimation import kernels
 
@@ -90,31 +90,9 @@ def test_a_worthless_accelerometer_changes_nothing_and_a_perfect_one_says_all():
     np.testing.assert_allclose(perfect.moments[1:, :3], perfect.force[1:], atol=1e-6)
 
 
-def run_moved(name, step_):
-    """Log-likelihood, innovations of the state and of the accelerometer's z axis with one parameter moved."""
-    tape = measured_tape(7, missing=0.2)
-    theta = plain.displaced(name, step_)
-    tau, delay, *offset = (theta - THETA)[4:]
-    tape.thrust += tau * tape.thrust_tau + delay * tape.thrust_delay
-    tape.torque += tau * tape.torque_tau + delay * tape.torque_delay + np.array(offset)
-    value = plain.forward(tape, mass=theta[0], inertia=INERTIA + np.diag(theta[1:4] - THETA[1:4]))
-    return value, tape.e.copy(), tape.force[1:, 2] - tape.thrust[1:] / theta[0]
-
-
 @pytest.mark.parametrize("name", range(9))
 def test_score_and_information_against_finite_differences(name):
-    tape = measured_tape(7, missing=0.2)
-    plain.forward(tape)
-    info = plain.sensitivities(tape)
-    np.testing.assert_allclose(info, info.T, rtol=1e-9)
-    h = 1e-4
-    (high, e_high, z_high), (low, e_low, z_low) = run_moved(name, h), run_moved(name, -h)
-    sd = 1 / np.sqrt(info[name, name])
-    assert tape.score[:, name].sum() * sd == pytest.approx((high - low) / (2 * h) * sd, abs=0.05)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        squares = np.where(tape.s > 0, ((e_high - e_low) / (2 * h)) ** 2 / tape.s, 0.0).sum()
-    squares += np.nansum(((z_high - z_low) / (2 * h)) ** 2 / (Q[2] / np.diff(tape.time) + R_FORCE))
-    assert info[name, name] == pytest.approx(squares, rel=0.02)
+    plain.assert_score_and_information(lambda: measured_tape(7, missing=0.2), name)
 
 
 def test_alone_it_tells_of_mass_what_its_noise_and_that_of_the_thrust_leave():
@@ -147,21 +125,3 @@ def test_missing_readings_breaks_and_unusable_steps_never_spread(holes, special,
     counted = ~np.isnan(tape.force)
     counted[[0, special]] = False
     assert tape.stats[:, kernels.MEASURED + ACCELEROMETER].sum() == counted.sum()
-
-
-def test_simulated_readings_are_consistent_with_the_filter():
-    """A drone stepped by the model with noise: innovations of state and accelerometer have the variance expected.
-
-    And the noise that the smoother finds in the accelerometer is the noise that was put in.
-    """
-    n = 600
-    tape = plain.simulated(np.random.default_rng(8), n, lead=0.0, dt=0.01)
-    with_readings = plain.forward(tape, lead=0.0)
-    plain.backward(tape, lead=0.0)
-    mean_square = np.mean(tape.e[1:] ** 2 / tape.s[1:])
-    assert mean_square == pytest.approx(1.0, abs=4 * np.sqrt(2 / (12 * n)))
-    found = tape.stats[:, kernels.RESIDUAL + ACCELEROMETER].sum() / (3 * (n - 1))
-    resolved = tape.stats[:, kernels.RESIDUAL_SEEN + ACCELEROMETER].sum()
-    assert found / R_FORCE == pytest.approx(1.0, abs=4 * np.sqrt(2 / resolved))
-    tape.force[:] *= 1.2  # readings of a wrong scale are less likely
-    assert plain.forward(tape, lead=0.0) < with_readings - 100

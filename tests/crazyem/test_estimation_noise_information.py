@@ -125,21 +125,6 @@ def test_the_score_from_the_smoother_is_the_slope_of_the_likelihood(lead, precis
         assert ours[a] == pytest.approx((high - low) / (2 * h), abs=0.01 * sd[a], rel=2e-3)
 
 
-@pytest.mark.parametrize("lead", [0.5, 0.0])
-def test_the_score_of_simulated_data_scatters_as_the_information_says(lead):
-    """Score' information^-1 score has the mean of a chi-square with eleven degrees of freedom; the score has mean 0."""
-    rng = np.random.default_rng(3)
-    runs, normed, scores = 60, [], []
-    for _ in range(runs):
-        tape = plain.simulated(rng, 30, lead=lead)
-        filtered(tape, lead=lead, smooth=True)
-        info = information(tape, lead=lead)
-        scores.append(score(tape) / np.sqrt(np.diag(info)))
-        normed.append(score(tape) @ np.linalg.solve(info, score(tape)))
-    assert np.mean(normed) == pytest.approx(SCALES, abs=4 * np.std(normed) / np.sqrt(runs))
-    assert np.abs(np.mean(scores, axis=0)).max() < 4 / np.sqrt(runs)
-
-
 def test_what_is_not_measured_has_no_information():
     tape = filled_tape(2)
     tape.y[:, 3:6] = np.nan

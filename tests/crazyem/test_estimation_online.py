@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import synthetic
 
-from crazyem.errors import DataError, UsageError
+from crazyem.errors import DataError, FileFormatError, UsageError
 from crazyem.estimation.em import WindowEM
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.signals.sample import Sample
-from crazyem.vehicle import load_vehicle
+from crazyem.vehicle import load_vehicle, parse_vehicle
 
 # commands with rotor lag, but as a wrench: the nominal constants of a Crazyflie, wrong for the drone that flies
 LAGGED = replace(load_vehicle("cf2"), thrust_curve=(), rotor_constant=None, thrust_max=math.inf)
@@ -86,26 +86,23 @@ def test_noise_scales_are_found_too(plain):
     assert [noise["torque_x"], noise["torque_y"]] == pytest.approx([TRUTH.torque_noise] * 2, rel=0.5)
 
 
-def test_the_same_samples_give_the_same_numbers(flight, plain):
-    assert begins(plain, feed(OnlineEstimator(LAGGED), synthetic.samples(flight)[:1500]))
+def shuffled(samples):
+    keys = np.random.default_rng(0).uniform(size=len(samples))
+    return [s for _, s in sorted(enumerate(samples), key=lambda e: (e[1].time, keys[e[0]]))]
 
 
-def test_the_order_of_samples_of_one_instant_does_not_matter(flight, plain):
-    samples = synthetic.samples(flight)[:1500]
-    rng = np.random.default_rng(0)
-    keys = rng.uniform(size=len(samples))
-    shuffled = [s for _, s in sorted(enumerate(samples), key=lambda e: (e[1].time, keys[e[0]]))]
-    assert shuffled != samples
-    assert begins(plain, feed(OnlineEstimator(LAGGED), shuffled))
+def with_more(samples):
+    unknown = {"specific_force": (0.0, 0.0, 9.81), "setpoint_position": (math.nan,) * 3}
+    return [one for s in samples for one in (s, s, *(Sample(name, s.time, v) for name, v in unknown.items()))]
 
 
-def test_signals_it_does_not_know_and_duplicates_change_nothing(flight, plain):
-    samples = synthetic.samples(flight)[:1500]
-    noisy = []
-    for sample in samples:
-        noisy += [sample, sample, Sample("specific_force", sample.time, (0.0, 0.0, 9.81)),
-                  Sample("setpoint_position", sample.time, (math.nan,) * 3)]  # fmt: skip
-    assert begins(plain, feed(OnlineEstimator(LAGGED), noisy))
+@pytest.mark.parametrize(
+    "change",
+    [list, shuffled, with_more],
+    ids=["the same samples", "another order of one instant", "duplicates and signals that it does not know"],
+)
+def test_the_same_numbers_come_of(flight, plain, change):
+    assert begins(plain, feed(OnlineEstimator(LAGGED), change(synthetic.samples(flight)[:1500])))
 
 
 def test_late_samples_are_counted_and_not_used(flight, plain):
@@ -379,3 +376,53 @@ def test_one_of_many_makes_fewer_full_passes_and_says_nearly_the_same(flight):
     final, other = alone.finish(), shared.finish()
     for name in NAMES:
         assert other[name].value == pytest.approx(final[name].value, abs=0.05 * final[name].sd)
+
+
+# -- absurd samples, logs that begin anywhere --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "line", ["mass = inf", "mass = 0.03\nrotor_constant = inf\narm = 0.03\ntorque_per_thrust = 0.007"]
+)
+def test_infinite_constants_are_malformed(line):
+    with pytest.raises(FileFormatError):
+        parse_vehicle(f'name = "a"\n{line}\ninertia = [1e-5, 1e-5, 1e-5]')
+
+
+@pytest.mark.parametrize(
+    ("signal", "value"),
+    [("attitude", (0.0, 0.0, 0.0, 0.0)), ("body_rate", (1e30, 0.0, 0.0)), ("position", (1e200, 0.0, 0.0))],
+)
+def test_one_absurd_sample_does_not_end_the_flight(signal, value):
+    estimator = OnlineEstimator(LAGGED, every=25)
+    for s in synthetic.samples(synthetic.fly(seed=11, duration=2.0)):
+        estimator.feed(replace(s, value=value) if s.signal == signal and abs(s.time - 1.5) < 1e-6 else s)
+    final = estimator.finish()
+    assert all(np.isfinite(p.value) for p in final.parameters.values())
+
+
+@pytest.mark.slow
+def test_a_log_that_begins_amid_a_manoeuvre_is_not_biased():
+    z = []
+    for seed in range(6):
+        estimator = OnlineEstimator(LAGGED, every=40)
+        for s in synthetic.samples(synthetic.fly(replace(TRUTH, fade=0.0, sensor=(1e-3, 1e-2, 1e-3, 2e-3)), seed=seed)):
+            estimator.feed(s)
+        final = estimator.finish()
+        z.append([(final[n].value - t) / final[n].sd for n, t in zip(("Ixx", "Iyy", "Izz"), TRUTH.inertia)])
+    assert np.all(np.abs(np.mean(z, 0)) < 1.2), np.mean(z, 0)  # sd of the mean 0.41
+
+
+@pytest.mark.slow
+def test_commands_stamped_between_the_measurements_under_noisy_control():
+    hits = 0
+    for seed in range(8):
+        flight = synthetic.fly(TRUTH, seed=seed)
+        estimator = OnlineEstimator(LAGGED, every=40)
+        for row in range(0, len(flight.fine_time) - 10, 10):
+            for n, c in synthetic.COLUMNS.items():
+                estimator.feed(Sample(n, flight.fine_time[row], tuple(flight.fine_y[row][c])))
+            estimator.feed(Sample("wrench_command", flight.fine_time[row + 2], tuple(flight.fine_wrench[row + 2])))
+        p = estimator.finish()["Ixx"]
+        hits += p.ci95[0] <= 2e-5 <= p.ci95[1]
+    assert hits >= 6, hits  # 5 of 8 or fewer has probability 0.006 at 95 %

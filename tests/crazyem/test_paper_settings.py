@@ -1,7 +1,6 @@
 """`crazyem paper`: settings by name, the plan, and how flights feed back."""
 
 from dataclasses import fields, replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -96,24 +95,31 @@ def test_plan_has_what_was_asked_for() -> None:
     assert {t.method for t in plan(("offline",), "C", ("crazyem",), 1)} == {"bound", "crazyem"}
 
 
-def test_online_flight_feeds_back_what_the_estimator_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A fake that says the truth: from the first update on the controller knows it, as a flight by hand does."""
-    asked: list[int] = []
+def faked(monkeypatch, task, *, mass_as_printed=0.18):
+    """The record of a flight whose estimator says the truth, but for a mass where it is not clamped; what was asked."""
+    sizes, made = [], []
 
     class Fake:
-        def __init__(self, settings: Settings, sensor: str, *, clamp: bool = False) -> None:
-            assert sensor == "B"
+        def __init__(self, settings, sensor, *, clamp=False):
+            made.append((sensor, clamp))
+            self.mass = 0.18 if clamp else mass_as_printed
 
-        def update(self, flight: Flight) -> tuple[float, Any]:
-            asked.append(flight.size)
-            return 0.18, np.array([2.5e-4, 3.1e-4, 2.0e-4])
+        def update(self, flight):
+            sizes.append(flight.size)
+            return self.mass, np.array([2.5e-4, 3.1e-4, 2.0e-4])
 
     monkeypatch.setattr(experiments, "PublishedOnline", Fake)
-    record = run_task(Task("online", "B", "published", 3), SMALL)
+    return run_task(task, SMALL), sizes, made
+
+
+def test_online_flight_feeds_back_what_the_estimator_says(monkeypatch):
+    """From the first update on the controller knows the truth, as a flight by hand does."""
+    record, sizes, made = faked(monkeypatch, Task("online", "B", "published", 3))
     by_hand = Flight(SMALL, 3)
     by_hand.advance(20, mass=0.001, inertia=(1e-4, 2e-4, 1e-4))
     by_hand.advance(SMALL.steps, mass=0.18, inertia=(2.5e-4, 3.1e-4, 2.0e-4))
-    assert asked == list(range(21, SMALL.steps + 2, 20))
+    assert made == [("B", False)]
+    assert sizes == list(range(21, SMALL.steps + 2, 20))
     step = max(1, SMALL.steps // experiments.PATH_POINTS)
     np.testing.assert_allclose(record["path"], by_hand.truth[::step, :3], atol=1e-4)
     assert record["times"]["mass_1"] == {"first": 0.1, "stays": 0.1}
@@ -123,20 +129,9 @@ def test_online_flight_feeds_back_what_the_estimator_says(monkeypatch: pytest.Mo
     assert record["tracking_rms_known_m"] == pytest.approx(np.sqrt(np.mean(np.sum(error**2, axis=1))), rel=1e-6)
 
 
-def test_a_published_flight_that_crashes_is_flown_again_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    clamps = []
-
-    class Fake:
-        def __init__(self, settings: Settings, sensor: str, *, clamp: bool = False) -> None:
-            clamps.append(clamp)
-            self.value = 0.18 if clamp else -0.18
-
-        def update(self, flight: Flight) -> tuple[float, Any]:
-            return self.value, np.array([2.5e-4, 3.1e-4, 2.0e-4])
-
-    monkeypatch.setattr(experiments, "PublishedOnline", Fake)
-    record = run_task(Task("online", "A", "published", 0), SMALL)
-    assert clamps == [False, True]
+def test_a_published_flight_that_crashes_is_flown_again_and_says_so(monkeypatch):
+    record, _, made = faked(monkeypatch, Task("online", "A", "published", 0), mass_as_printed=-0.18)
+    assert made == [("A", False), ("A", True)]
     assert record["crashed_as_printed_after_s"] > 0
     assert not record["crashed"]
     assert len(record["windows"]) == 1

@@ -1,6 +1,5 @@
 """Tables of `crazyem paper`: statistics of hand-made records against plain arithmetic, and the text made of them."""
 
-import html.parser
 import itertools
 import json
 import math
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import paper_pages as docs
 import pytest
+from html_pages import Page
 from hypothesis import given
 from hypothesis import strategies as st
 from made_paper import BOUND, TRUE, offline, online, results_of, table1, whole_run
@@ -210,32 +210,10 @@ def test_short_numbers(value) -> None:
 # text ---------------------------------------------------------------------------------------------------------
 
 
-class _Balanced(html.parser.HTMLParser):
-    """Every element that is opened is closed, in order; collects links and scripts."""
-
-    VOID = frozenset({"meta", "img", "br"})
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.links: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        assert tag not in ("script", "iframe", "link")
-        self.links += [v for k, v in attrs if k in ("href", "src") and v]
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-
 def test_page_is_complete_in_itself() -> None:
     results = results_of(whole_run(2, updates=8))
     figures = [{"number": 9, "file": "figure_09", "caption": "a < b & c", "note": ""}]
-    page = _Balanced()
-    page.feed(index_html(results, figures))
-    assert page.open == []
+    page = Page(index_html(results, figures))
     assert {"figures/figure_09.svg", "figures/figure_09.png", "results.json", "tables.md"} == set(page.links)
 
 
@@ -253,9 +231,7 @@ def test_markdown_tables_are_rectangular_and_complete() -> None:
 def test_cells_of_any_text_stay_cells(texts) -> None:
     grid = Grid("t", tuple(texts), (tuple(texts),))
     assert all(len(re.split(r"(?<!\\)\|", line)) == len(texts) + 2 for line in grid.markdown(heading="").split("\n"))
-    page = _Balanced()
-    page.feed(grid.html())
-    assert page.open == []
+    Page(grid.html())
 
 
 @pytest.mark.parametrize("method", ["published", "crazyem"])

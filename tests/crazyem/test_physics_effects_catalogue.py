@@ -84,50 +84,43 @@ def test_neutral_changes_nothing(name: str) -> None:
         np.testing.assert_array_equal(after[1], before[1])
 
 
+def changeable(path, effects):
+    """What effects can change, each in one row: motion; what sensors show; thrust by commands and by speeds."""
+    moved, shown = (f(path, vehicle=ROTORS, effects=effects) for f in (motion, measured))
+    thrust = [
+        rotor_thrust(flown_inputs(measured_speeds=speeds), 0.01 * np.arange(5, 50), vehicle=ROTORS, effects=effects)[0]
+        for speeds in (False, True)
+    ]
+    arrays = (moved.specific_force, moved.angular_acceleration), (shown.state, shown.specific_force), thrust
+    return [np.concatenate([a.ravel() for a in part]) for part in arrays]
+
+
 @pytest.mark.parametrize("name", [n for n in CATALOGUE if n != "gusts"])
-def test_away_from_neutral_it_changes_something(name: str) -> None:
+def test_away_from_neutral_it_changes_something(name):
     """Each effect, a few scales away, is seen by exactly the function that it is for."""
     effect = CATALOGUE[name]
     values = dict(effect.complete({}, vehicle_values(ROTORS).get(name, {})))
     for p in effect.parameters:
         if not p.chosen and values[p.name] is not None:
             values[p.name] += 3 * p.scale
-    effects: Effects = {name: values}
     path = still(60, velocity=np.c_[np.sin(0.1 * np.arange(60)), np.cos(0.1 * np.arange(60)), np.ones(60)],
                  body_rate=[0.1, 0.2, 0.3], specific_force=[1.0, 2.0, 9.0], thrust=[0.08, 0.07, 0.07, 0.07],
                  thrust_rate=[0.1, 0, 0, 0])  # fmt: skip
-    plain, moved = (motion(path, vehicle=ROTORS, effects=e) for e in ({}, effects))
-    moves = bool(np.abs(moved.specific_force - plain.specific_force).max() > 1e-6) or bool(
-        np.abs(moved.angular_acceleration - plain.angular_acceleration).max() > 1e-6
-    )
-    offset = measured(path, vehicle=ROTORS, effects=effects)
-    shows = bool(offset.state.any() or offset.specific_force.any())
-    nodes = 0.01 * np.arange(5, 50)
-    drives = False
-    for speeds in (False, True):
-        inputs = flown_inputs(measured_speeds=speeds)
-        one, other = (rotor_thrust(inputs, nodes, vehicle=ROTORS, effects=e)[0] for e in ({}, effects))
-        drives |= bool(np.abs(one - other).max() > 1e-9)
-    assert shows == (effect.measured is not None)
-    assert drives == any((effect.commanded, effect.speed, effect.timing))
-    acts = (effect.rotors, effect.turning, effect.body, effect.external, effect.tied)
-    assert moves == any(acts)
+    largest = [np.abs(a - b).max() for a, b in zip(changeable(path, {}), changeable(path, {name: values}))]
+    assert (largest[0] > 1e-6) == any((effect.rotors, effect.turning, effect.body, effect.external, effect.tied))
+    assert (largest[1] > 0) == (effect.measured is not None)
+    assert (largest[2] > 1e-9) == any((effect.commanded, effect.speed, effect.timing))
 
 
-def everything(name: str, values: dict) -> np.ndarray:
-    """All that an effect can change on a short flight near the floor, with measured speeds and without, in one row."""
+def everything(name, values):
+    """All that an effect can change on a short flight near the floor, in one row."""
     t = 0.01 * np.arange(60)
     path = still(60, velocity=np.c_[np.sin(5 * t), np.cos(3 * t), np.sin(4 * t)], position=np.c_[t, 1 - t, 1 + t],
                  body_rate=np.c_[t, np.sin(9 * t), 1 - t],
                  specific_force=[1.0, 2.0, 9.0], thrust=[0.08, 0.07, 0.07, 0.07], thrust_rate=[0.1, 0, 0, 0],
                  angular_acceleration=np.c_[np.cos(t), 9 * np.cos(9 * t), t], height=np.full(60, 0.1),
                  fused=True)  # fmt: skip
-    effects: Effects = {name: values}
-    moved, shown = (f(path, vehicle=ROTORS, effects=effects) for f in (motion, measured))
-    found = [moved.specific_force, moved.angular_acceleration, shown.state, shown.specific_force]
-    for speeds in (False, True):
-        found.append(rotor_thrust(flown_inputs(measured_speeds=speeds), t[5:50], vehicle=ROTORS, effects=effects)[0])
-    return np.concatenate([array.ravel() for array in found])
+    return np.concatenate(changeable(path, {name: values}))
 
 
 @pytest.mark.parametrize("name", [n for n in CATALOGUE if n != "gusts"])

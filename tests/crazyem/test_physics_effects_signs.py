@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from crazyem.physics.effects.effect import Effects, Situation
 from crazyem.physics.effects.rotors import TYPICAL_ROTOR_CONSTANT
 from crazyem.physics.motion import RotorInput, measured, motion, rotor_thrust
-from crazyem.physics.rotations import axes, rotation_between
+from crazyem.physics.rotations import rotation_between
 
 M = CF2.mass
 IYY = CF2.inertia[1]
@@ -274,12 +274,6 @@ def test_rotation_between_is_the_logarithm_also_near_half_a_turn() -> None:
     np.testing.assert_allclose(found[300:], vector[300:], rtol=1e-3, atol=1e-14)
     exactly = rotation_between(np.eye(3)[None], np.diag([1.0, -1.0, -1.0])[None])
     np.testing.assert_allclose(np.abs(exactly), [[np.pi, 0, 0]], atol=1e-12)
-
-
-def test_axes_are_yaw_pitch_roll() -> None:
-    np.testing.assert_allclose(
-        axes(0.3, -0.5, 1.2), Rotation.from_euler("ZYX", [1.2, -0.5, 0.3]).as_matrix(), atol=1e-12
-    )
 
 
 def test_effects_do_not_write_into_the_situation() -> None:

@@ -1,13 +1,18 @@
-"""The rotor lag: means over steps against brute-force integration, what a step may know, derivatives, the predictor."""
+"""The rotor lag: means over steps against brute-force integration, derivatives, the predictor; sampled commands."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
+from crazyem.physics.effects.timing import MODES, shrunk
 from crazyem.physics.lag import CAUSAL, HOLD, LINEAR, PREDICTION_ORDER, fit_predictor, hold_predictor, lagged_means
+from crazyem.physics.motion import RotorInput, rotor_thrust
+from crazyem.vehicle import load_vehicle
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -181,16 +186,6 @@ def test_incremental_calls_equal_one_call(seed, mode, split, tau):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("mode", [LINEAR, HOLD, CAUSAL])
-def test_a_constant_command_stays_and_nothing_depends_on_lag_or_delay(mode):
-    t = np.arange(50) * 0.01
-    commands = np.tile([0.3, 1e-4, -2e-4, 1e-5], (50, 1))
-    mean, by_tau, by_delay, _ = run(t, commands, t[3:] + 0.001, mode=mode, tau=0.06, delay=0.004)
-    np.testing.assert_allclose(mean[1:], commands[4:], rtol=1e-12)
-    np.testing.assert_allclose(by_tau, 0.0, atol=1e-8)
-    np.testing.assert_allclose(by_delay, 0.0, atol=1e-8)
-
-
 def test_a_node_that_does_not_advance_gives_the_present_value():
     t = np.arange(10) * 0.01
     commands = np.outer(np.ones(10), [0.3, 0, 0, 0])
@@ -249,3 +244,70 @@ def test_without_derivatives_the_means_are_the_same(seed, tau, delay, mode):
     np.testing.assert_array_equal(alone, mean)
     np.testing.assert_array_equal(late, by_delay)
     np.testing.assert_array_equal(lagged, state[[0, 1, 2, 3, 12]])
+
+
+# -- commands that are logged slower than their loop -------------------------------------------------------------------
+
+
+Array = NDArray[np.float64]
+DRONE = replace(load_vehicle("cf2"), thrust_curve=())
+
+
+def loop(seed: int, *, jitter: float, seconds: float = 40.0) -> tuple[Array, Array]:
+    """Stamps (n,) every 2 ms and thrusts (n, 4) [N]: slow sways of all modes, jitter of the torques about x, y."""
+    rng = np.random.default_rng(seed)
+    time = 2e-3 * np.arange(int(seconds / 2e-3))
+    modes = np.zeros((time.size, 4))
+    phase = rng.uniform(0, 6, (4, 6))
+    for k, f in enumerate((0.3, 0.7, 1.1, 1.6, 2.0, 2.6)):
+        modes += 0.004 * np.sin(2 * np.pi * f * time[:, None] + phase[:, k])
+    modes[:, 1:3] += jitter * rng.normal(size=(time.size, 2))
+    return time, 0.07 + modes @ MODES.T
+
+
+def test_modes_are_orthonormal() -> None:
+    np.testing.assert_allclose(MODES.T @ MODES, np.eye(4), atol=1e-15)
+
+
+def test_only_what_is_new_is_shrunk_and_only_of_its_axis() -> None:
+    """Jitter is hardly foretold, so its share is lost; sways of 3 Hz and less are, and stay; so does all thrust."""
+    _, thrust = loop(1, jitter=0.02)
+    sampled = thrust[::5]
+    found = shrunk(sampled, tilt=0.6, turn=0.6) @ MODES
+    modes = sampled @ MODES
+    spread = [np.diff(m, axis=0).std(0) for m in (found, modes)]
+    np.testing.assert_allclose(found[:, 0], modes[:, 0], atol=1e-15)
+    np.testing.assert_allclose(found[:, 3], modes[:, 3], atol=1e-4)
+    assert np.all(spread[0][1:3] < 0.55 * spread[1][1:3])
+    one = shrunk(sampled, tilt=0.0, turn=0.6) @ MODES
+    np.testing.assert_allclose(one[:, :3], modes[:, :3], atol=1e-15)
+
+
+def test_with_the_share_that_errs_least_torques_are_as_strong_as_they_were() -> None:
+    """Errors in the variables: the slope of the true torque on that of every fifth command is too small; an estimate
+    that errs least has errors that are no part of it, so its slope is 1."""
+    time, thrust = loop(2, jitter=0.012)
+    nothing = np.full(time.size, np.nan)
+    nodes = time[250::5]
+
+    def torque(every: int, share: float) -> Array:
+        effects = {"sampled_commands": {"tilt": share}} if share else {}
+        inputs = RotorInput(time[::every], thrust[::every], nothing[::every], time[::every], False, aged=every > 1)
+        return (rotor_thrust(inputs, nodes, vehicle=DRONE, effects=effects)[0] @ MODES)[:, 1:3].ravel()
+
+    true = torque(1, 0.0)
+    goal = true - true.mean()
+    found = []
+    for share in np.linspace(0.0, 1.0, 11):
+        logged = torque(5, float(share))
+        logged = logged - logged.mean()
+        found.append((float(np.var(logged - goal)), float(logged @ goal / (logged @ logged))))
+    least = min(found)
+    assert found[0][1] < 0.9
+    assert least[0] < 0.75 * found[0][0]
+    assert least[1] == pytest.approx(1.0, abs=0.06)
+
+
+def test_too_few_commands_stay_as_they_are() -> None:
+    few = np.full((3, 4), 0.07)
+    assert shrunk(few, tilt=0.5, turn=0.5) is few
