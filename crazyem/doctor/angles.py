@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor import axes
 from crazyem.doctor.delays import delay
+from crazyem.doctor.hypotheses import sign_factor, signed
 from crazyem.doctor.kinematics import (
     Track,
     Window,
@@ -190,7 +190,7 @@ def _euler_findings(
     """Finding by the best reading of Euler angles: an inverted sign, another order or unit."""
     if choice.denied:
         what = choice.name.removeprefix("as declared ")
-        factor = axes.sign_factor(what, ANGLE_NAMES) if choice.name else None
+        factor = sign_factor(what, ANGLE_NAMES) if choice.name else None
         if factor is not None:
             turned = " and ".join(ANGLE_NAMES[i] for i in range(3) if factor[i] < 0)
             text = f"{head}the sign of {turned} is inverted."
@@ -228,7 +228,7 @@ def _unit_variance(value: Array) -> Array:
 def _orders(x: Array, known: NDArray[np.bool_]) -> dict[str, tuple[int, Array]]:
     """Hypotheses of signs, and of the order yaw, pitch, roll; components that are not `known` are zero."""
     out = {}
-    for key, (cost, value) in axes.signed("as declared", x, ANGLE_NAMES).items():
+    for key, (cost, value) in signed("as declared", x, ANGLE_NAMES).items():
         if cost <= 2 or [part.lstrip("-") for part in key.split(" ")[-3:]] == ["yaw,", "pitch,", "roll"]:
             out[key] = (cost, value * known)
     return out

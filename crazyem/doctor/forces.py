@@ -5,8 +5,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from crazyem.doctor import axes
-from crazyem.doctor.hypotheses import Comparison, compare_hypotheses, misread, wrong_unit
+from crazyem.doctor.hypotheses import (
+    Comparison,
+    compare_hypotheses,
+    known_factor,
+    misread,
+    scale_fault,
+    slope_numbers,
+    wrong_unit,
+)
 from crazyem.doctor.kinematics import (
     GRAVITY,
     GRID_STEP,
@@ -234,7 +241,7 @@ def _acceleration(name: str, array: SignalArray, moving: SignalArray, attitudes:
     head = f"{name} against {seen.against}: "
     if seen.choice.denied:
         return [misread("forces", name, seen, _ACCELERATION_MISREAD, noun="world's", what="")]
-    unit = axes.known_factor(seen.whole, FORCE_UNITS)
+    unit = known_factor(seen.whole, FORCE_UNITS)
     if unit:
         text = f"{head}it is {seen.whole.value:.4g} times as large: {_unit_said(unit[0])}, not m/s^2."
         return [wrong_unit("forces", name, text, unit[1], evidence, "Correct its unit where it is read.")]
@@ -243,11 +250,11 @@ def _acceleration(name: str, array: SignalArray, moving: SignalArray, attitudes:
         text = f"{head}gravity is still in it (its mean is {seen.mean[2]:.2f} m/s^2 along z)."
         numbers = {**evidence, "gravity_level": level}
         return [Finding("forces", Grade.UNUSABLE, text, name, (), numbers, "Take gravity off its z.")]
-    fault = axes.scale_fault(seen.whole, seen.single, SCALE_FAULT) if seen.covered >= 0.5 else None
+    fault = scale_fault(seen.whole, seen.single, SCALE_FAULT) if seen.covered >= 0.5 else None
     if fault is None:
         return []
     text = f"{head}{fault.text}."
-    numbers = {**evidence, **axes.numbers(seen.single)}
+    numbers = {**evidence, **slope_numbers(seen.single)}
     advice = (
         "Use the derivative of the velocity; a tilt that its filter takes for larger than it is makes such a factor."
     )

@@ -1,7 +1,15 @@
 """Check: velocity against the derivative of position, and positions of two origins: unit, frame, sign, scale."""
 
-from crazyem.doctor import axes
-from crazyem.doctor.hypotheses import Comparison, agreed_scale, compare_hypotheses, misread, wrong_scale, wrong_unit
+from crazyem.doctor.hypotheses import (
+    Comparison,
+    agreed_scale,
+    compare_hypotheses,
+    known_factor,
+    misread,
+    slope_numbers,
+    wrong_scale,
+    wrong_unit,
+)
 from crazyem.doctor.kinematics import Track, difference, grid_of, measurements, poses, track, width_for
 from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Grade
@@ -67,11 +75,11 @@ def _judge(name: str, looks: list[Comparison], blamed: set[str]) -> list[Finding
     evidence = best.evidence()
     if best.choice.denied:
         return [misread("velocities", name, best, _MISREAD, noun="world")]
-    unit = axes.known_factor(whole, VELOCITY_UNITS)
+    unit = known_factor(whole, VELOCITY_UNITS)
     if unit:
         text = f"{head}it is {whole.value:.4g} times as large: it is in {unit[0]}, not m/s."
         return [wrong_unit("velocities", name, text, unit[1], evidence)]
-    unit = axes.known_factor(whole, POSITION_UNITS)
+    unit = known_factor(whole, POSITION_UNITS)
     if unit:
         if best.against in blamed:
             return []
@@ -92,21 +100,21 @@ def _judge_position(name: str, seen: Comparison, blamed: set[str]) -> list[Findi
     head = f"{name} against {seen.against}: "
     if seen.choice.denied:
         return [misread("velocities", name, seen, _MISREAD, noun="world", what="")]
-    unit = axes.known_factor(whole, POSITION_UNITS)
+    unit = known_factor(whole, POSITION_UNITS)
     if unit:
         blamed.add(seen.against)
         text = (
             f"{seen.against} against {name}: it is {1.0 / whole.value:.4g} times as large: it is in {unit[0]}, not m."
         )
         return [wrong_unit("velocities", seen.against, text, 1.0 / unit[1], seen.evidence())]
-    unit = axes.known_factor(whole, {key: 1.0 / factor for key, factor in POSITION_UNITS.items()})
+    unit = known_factor(whole, {key: 1.0 / factor for key, factor in POSITION_UNITS.items()})
     if unit:
         text = f"{head}it is {whole.value:.4g} times as large: it is in {unit[0]}, not m."
         return [wrong_unit("velocities", name, text, unit[1], seen.evidence())]
     agreed = agreed_scale([seen], SCALE_FAULT)
     if agreed is None:
         return []
-    numbers = {**seen.evidence(), **axes.numbers(seen.single)}
+    numbers = {**seen.evidence(), **slope_numbers(seen.single)}
     text = f"{name} and {seen.against} differ in scale: {agreed[1].text}, if {seen.against} is right."
     advice = "Find out which of the two is calibrated."
     return [Finding("velocities", Grade.DEGRADES, text, name, (), numbers, advice)]

@@ -8,7 +8,7 @@ import pytest
 from crazyem.cli import main
 from crazyem.errors import FileFormatError
 from crazyem.recordings import Finding, Recording, open_recording
-from crazyem.recordings.parts import open_parts
+from crazyem.recordings.registry import open_parts
 
 CASES = Path(__file__).parent / "cases"
 

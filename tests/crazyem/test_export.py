@@ -22,7 +22,7 @@ from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.recordings import Event, Finding, Fix, Grade, ReadOptions, Recording, SignalArray, open_recording
 from crazyem.recordings.csv.exported import read, read_parts
 from crazyem.recordings.export import METADATA_SUFFIX, export, export_parts
-from crazyem.recordings.parts import free_memory, is_large, open_parts
+from crazyem.recordings.registry import free_memory, is_large, open_parts
 from crazyem.signals.sample import SIGNALS
 
 ODD = [

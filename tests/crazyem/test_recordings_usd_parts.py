@@ -11,7 +11,7 @@ from test_recordings_usd import FIXED, header, log, logs, record, small_log
 
 from crazyem.errors import CrazyemError, FileFormatError
 from crazyem.recordings import ReadOptions, Recording
-from crazyem.recordings.parts import open_parts
+from crazyem.recordings.registry import open_parts
 from crazyem.recordings.usd.file import read, read_parts
 
 

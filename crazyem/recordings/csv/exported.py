@@ -16,8 +16,7 @@ from crazyem.recordings.columns import MARKED_COLUMN, Description, SignalEntry, 
 from crazyem.recordings.contents import GrowingArray, ReadOptions
 from crazyem.recordings.csv.text import BLOCK_BYTES, LONGEST_LINE, Damage, text_blocks
 from crazyem.recordings.csv.wide import damage_notes
-from crazyem.recordings.description import from_json
-from crazyem.recordings.export import HOST_TIME, METADATA_SUFFIX, TIME
+from crazyem.recordings.export import HOST_TIME, METADATA_SUFFIX, TIME, from_json
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.signals.sample import SIGNALS, components

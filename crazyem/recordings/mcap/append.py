@@ -11,11 +11,22 @@ from typing import Any
 from mcap.records import Channel, MetadataIndex
 
 from crazyem.errors import FileFormatError
-from crazyem.recordings.mcap.messages import PROFILE
 from crazyem.recordings.mcap.output import Book, index_record, note_chunk
-from crazyem.recordings.mcap.scan import DATA_END, HEAD, MCAP_MAGIC, MESSAGE_INDEX, METADATA, Loss, Problem
-from crazyem.recordings.mcap.schemas import session_of
-from crazyem.recordings.mcap.survey import Part, index_of, parse, parts, profile_of
+from crazyem.recordings.mcap.scan import (
+    DATA_END,
+    HEAD,
+    MCAP_MAGIC,
+    MESSAGE_INDEX,
+    METADATA,
+    Loss,
+    Part,
+    Problem,
+    index_of,
+    parse,
+    parts,
+    profile_of,
+)
+from crazyem.recordings.mcap.schemas import PROFILE, session_of
 
 
 def reopen(path: Path) -> "Continued":

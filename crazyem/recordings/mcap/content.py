@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from crazyem.recordings.contents import GrowingArray
 from crazyem.recordings.mcap import scan as mcap_scan
 from crazyem.recordings.mcap import schemas
-from crazyem.recordings.mcap.messages import EVENT_TOPICS, OTHER_EVENT_TOPIC, fields_of
+from crazyem.recordings.mcap.scan import Part, parse
+from crazyem.recordings.mcap.schemas import EVENT_TOPICS, OTHER_EVENT_TOPIC, fields_of
 from crazyem.recordings.mcap.stream_codec import MOST_FIELDS, MOST_SIGNALS, FixedMessages, StreamLayout
-from crazyem.recordings.mcap.survey import Part, parse
 from crazyem.recordings.recording import Event, SignalArray
 from crazyem.recordings.tables import Table
 from crazyem.signals.sample import Block

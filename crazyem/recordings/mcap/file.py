@@ -9,9 +9,8 @@ from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.mcap.content import Content, join
 from crazyem.recordings.mcap.findings import IMPORT_METADATA, finding_of, findings_from_json
-from crazyem.recordings.mcap.messages import PROFILE
-from crazyem.recordings.mcap.scan import MCAP_MAGIC, Loss, Problem
-from crazyem.recordings.mcap.survey import Part, from_summary, parts, profile_of
+from crazyem.recordings.mcap.scan import MCAP_MAGIC, Loss, Part, Problem, from_summary, parts, profile_of
+from crazyem.recordings.mcap.schemas import PROFILE
 from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.tables import Table, signals_from_tables

@@ -1,8 +1,8 @@
 """Write MCAP records: chunks of bounded size, their indexes, and the summary; also into an existing file.
 
-Differences to mcap.writer, whose record types are used: chunks stay below their limit, whole arrays of messages are
-written at once, a file can be continued, and schemas and channels are repeated every few chunks (so that a damaged
-chunk does not make other chunks unreadable).
+Differences to mcap.writer, whose record types are used: chunks stay below their limit, a file can be
+continued, and schemas and channels are repeated every few chunks (so that a damaged chunk does not make other chunks
+unreadable).
 """
 
 import errno
@@ -144,19 +144,6 @@ class Output:
         self._index.setdefault(channel, []).append((log_time, self._place()))
         self._buffer += record
 
-    def messages(self, packed: bytes, index: Mapping[int, NDArray[np.uint64]]) -> None:
-        """Write a chunk of ready message records.
-
-        Args:
-            packed: consecutive message records.
-            index: channel -> (n, 2) log time [ns] and offset in `packed` of each of its messages.
-        """
-        self.flush()
-        place = self._place()
-        self._buffer += packed
-        shift = np.array([0, place], np.uint64)
-        self._close_chunk({channel: pairs + shift for channel, pairs in index.items()})
-
     def _place(self) -> int:
         """Offset of the next message in the chunk; first repeats the announcements if due."""
         if not self._index and self._since >= ANNOUNCE_EVERY:
@@ -165,12 +152,6 @@ class Output:
                 self._buffer[:] = announcements
             self._since = 0
         return len(self._buffer)
-
-    @property
-    def room(self) -> int:
-        """Bytes of messages that fit into the next chunk of `messages`."""
-        waiting = len(self._buffer) if not self._index else 0
-        return max(1, CHUNK_BYTES - max(waiting, len(self._announcements()) if self._since >= ANNOUNCE_EVERY else 0))
 
     def flush(self, *, sync: bool = False) -> None:
         """Close the current chunk, if it has messages, and pass all data to the operating system.
@@ -198,7 +179,7 @@ class Output:
     def chunk(
         self, compression: str, packed: bytes, *, size: int, crc: int, index: Mapping[int, NDArray[np.uint64]]
     ) -> None:
-        """Write a packed chunk, with the index of its messages (as in `messages`, offsets in the unpacked chunk).
+        """Write a packed chunk, with its index: channel -> (n, 2) log time [ns] and offset in the unpacked chunk.
 
         Its schemas and channels must be announced already, or be in the chunk.
         """

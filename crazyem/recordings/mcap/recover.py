@@ -9,10 +9,20 @@ import numpy as np
 from crazyem.atomic_file import new_file
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings.mcap import scan as mcap_scan
-from crazyem.recordings.mcap.messages import PROFILE
 from crazyem.recordings.mcap.output import Output
-from crazyem.recordings.mcap.scan import HEAD, MCAP_MAGIC, Loss, Problem
-from crazyem.recordings.mcap.survey import Part, from_summary, index_of, parse, parts, profile_of
+from crazyem.recordings.mcap.scan import (
+    HEAD,
+    MCAP_MAGIC,
+    Loss,
+    Part,
+    Problem,
+    from_summary,
+    index_of,
+    parse,
+    parts,
+    profile_of,
+)
+from crazyem.recordings.mcap.schemas import PROFILE
 
 
 @dataclass
@@ -153,15 +163,16 @@ def _messages(output: Output, part: Part, report: Report) -> None:
         return
     report.messages += len(messages)
     report.chunks += 1
-    if not defined.all():
-        packed = b"".join(scan.data[at - 31 : at + length].tobytes() for at, length, *_ in messages.tolist())
-        output.messages(packed, index_of(mcap_scan.scan(packed).messages))
-    elif part.chunk is not None:
+    if part.chunk is not None and defined.all():
         chunk = part.chunk
         output.flush_announcements()
         output.chunk(chunk.compression, bytes(chunk.packed), size=chunk.size, crc=chunk.crc, index=index_of(messages))
-    else:
-        output.messages(scan.data.tobytes(), index_of(messages))
+        return
+    output.announce_again()
+    for at, length, channel, log_time, published, sequence in messages.tolist():
+        data = scan.data[at : at + length].tobytes()
+        output.message(channel, log_time % 2**64, data, sequence=sequence, publish_time=published % 2**64)
+    output.flush()
 
 
 def _attachment(source: Path, part: Part, output: Output) -> int:

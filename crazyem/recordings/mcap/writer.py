@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 from crazyem.errors import UsageError
 from crazyem.links.base import LinkStatistics, ParameterWrite
 from crazyem.recordings.mcap import schemas
-from crazyem.recordings.mcap.messages import (
+from crazyem.recordings.mcap.output import Output
+from crazyem.recordings.mcap.schemas import (
     EVENT_TOPICS,
     FRAMES_TOPIC,
     POSE_PERIOD,
@@ -24,7 +25,6 @@ from crazyem.recordings.mcap.messages import (
     timestamp,
     versions,
 )
-from crazyem.recordings.mcap.output import Output
 from crazyem.signals.sample import Block, Packet, Sample
 from crazyem.signals.vocabulary import BlockDecoder, decoders
 

@@ -18,8 +18,7 @@ from rosbags.rosbag2 import Reader
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.mcap.scan import Loss, Problem
-from crazyem.recordings.mcap.survey import parts
+from crazyem.recordings.mcap.scan import Loss, Problem, parts
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.ros.ros2_messages import LARGEST_MESSAGE, MessageType, message_type, standard_definition
 from crazyem.recordings.ros.rosbag2_signals import ROBOT_TYPES, WORLD_TOPICS, BagMapping, BagTopic, recording_of
