@@ -20,9 +20,8 @@ from crazyem.doctor.kinematics import (
     width_for,
 )
 from crazyem.doctor.regression import Choice, blocks, choose, slope
-from crazyem.doctor.streams import runs
 from crazyem.physics.rotations import euler_from_quaternion, rotate
-from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.finding import Finding, Fix, Grade, runs_of
 from crazyem.recordings.recording import Recording, SignalArray
 
 Array = NDArray[np.float64]
@@ -215,7 +214,7 @@ def _upright(attitude: Track, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     angles = np.abs(euler_from_quaternion(attitude.value))
     far = (angles[:, 0] < LARGEST_ANGLES[0]) & (angles[:, 1] < LARGEST_ANGLES[1]) | ~attitude.valid
     out = np.zeros(valid.size, bool)
-    first, last = max(runs(far), key=np.ptp, default=(0, 0))
+    first, last = max(runs_of(far), key=np.ptp, default=(0, 0))
     out[first:last] = True
     return out & valid
 

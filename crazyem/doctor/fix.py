@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from crazyem.doctor import CHECKS, Check
 from crazyem.doctor.kinematics import continuous
-from crazyem.doctor.streams import runs as runs_of
 from crazyem.physics.rotations import rotation_matrix
-from crazyem.recordings.finding import Finding, Fix
+from crazyem.recordings.finding import Finding, Fix, runs_of
 from crazyem.recordings.ordering import Array, sound_rows, sound_samples
 from crazyem.recordings.recording import Recording, SignalArray
 

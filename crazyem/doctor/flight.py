@@ -9,9 +9,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from crazyem.doctor.streams import longest, runs
+from crazyem.doctor.streams import longest
 from crazyem.recordings.airborne import Airtime, airtime
-from crazyem.recordings.finding import Finding, Grade, intervals_of
+from crazyem.recordings.finding import Finding, Grade, intervals_of, runs_of
 from crazyem.recordings.ordering import Array, Intervals, inside, ordered
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.thrust import is_rotorcraft, kind_objection
@@ -108,7 +108,7 @@ def _upsets(flight: Airtime, tilt: tuple[Array, Array] | None) -> Iterator[Findi
     time, angle = tilt
     rows = inside(time, flight.airborne) & (angle > UPSET_TILT)
     # one or two samples are bad numbers, not a roll-over
-    for first, last in runs(rows):
+    for first, last in runs_of(rows):
         if last - first < 3:
             rows[first:last] = False
     if not rows.any():

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crazyem.doctor.streams import COMMAND_SIGNALS, cadence, graded, places, runs
-from crazyem.recordings.finding import Finding, Fix, Grade, percent
+from crazyem.doctor.streams import COMMAND_SIGNALS, cadence, graded, places
+from crazyem.recordings.finding import Finding, Fix, Grade, percent, runs_of
 from crazyem.recordings.ordering import Array, Flags, sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -95,14 +95,14 @@ def _signal(name: str, array: SignalArray) -> Iterator[Finding]:
     present = sound_rows(value)
     share = hits / int(present.sum())
     wide = np.convolve(line.on, [1, 1, 1], "same") > 0
-    spans = runs(wide)
+    spans = runs_of(wide)
     lasting = float((time[spans[:, 1] - 1] - time[spans[:, 0]]).max())
     moving = hits + int((line.bend & present).sum())
     evidence = {"samples": hits, "share": share, "runs": len(spans), "longest_s": lasting}
     fix = Fix("mark", (name,), rows=rows[line.on])
     if hits > RESAMPLED_SHARE * moving:
         duration = float(time[-1] - time[0])
-        knots = runs(line.bend)
+        knots = runs_of(line.bend)
         beat = cadence(time[knots[:, 0]]).period if len(knots) else 0.0
         rate = 1.0 / beat if beat > 0 else len(knots) / max(duration, 1e-9)
         stored = (time.size - 1) / max(duration, 1e-9)

@@ -1,15 +1,15 @@
 """Contents of a recording: signals, clocks, origin, extremes of the motion, and what can be identified from it."""
 
-import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from crazyem.doctor.envelope import Envelope, envelope
 from crazyem.doctor.identifiability import Verdict, identifiability, replay_objection
+from crazyem.notebook import finite
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.finding import percent
 from crazyem.recordings.ordering import sound_rows
@@ -79,26 +79,14 @@ class Inventory:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: units in the names of the keys, None where unknown."""
-        return {
-            "path": self.path,
-            "source": self.source,
-            "duration_s": self.duration_s,
-            "samples": self.samples,
-            "vehicle": self.vehicle,
-            "signals": [_listed(asdict(row)) for row in self.signals],
-            "clocks": [asdict(row) for row in self.clocks],
-            "metadata": {section: dict(values) for section, values in self.metadata.items()},
-            "events": dict(self.events),
-            "envelope": _listed(asdict(self.envelope)),
-            "identifiable": [asdict(verdict) for verdict in self.verdicts],
-            "kind": self.kind,
-            "objections": {
-                "kind": self.other_kind,
-                "weight": self.unlike,
-                "flight": self.on_the_ground,
-                "replay": self.no_replay,
-            },
-        }
+        objections = {"kind": "other_kind", "weight": "unlike", "flight": "on_the_ground", "replay": "no_replay"}
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in objections.values()}
+        values |= {key: [asdict(row) for row in values.pop(key)] for key in ("signals", "clocks")}
+        values["identifiable"] = [asdict(verdict) for verdict in values.pop("verdicts")]
+        values["envelope"] = asdict(self.envelope)
+        values["objections"] = {key: getattr(self, name) for key, name in objections.items()}
+        plain: dict[str, Any] = finite(values)
+        return plain
 
     def text(self, *, everything: bool = False) -> str:
         """A summary of at most 20 lines; with `everything`, then also metadata, clocks and all signals."""
@@ -209,17 +197,6 @@ def _short(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, str
             if len(text := str(value)) <= _LONGEST_TEXT and "\n" not in text:
                 kept.setdefault(section, {})[key] = text
     return kept
-
-
-def _listed(values: dict[str, Any]) -> dict[str, Any]:
-    """Values for JSON: tuples become lists, numbers that are not finite become None."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, tuple | list):
-            return [plain(item) for item in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return {key: plain(value) for key, value in values.items()}
 
 
 def _metadata_lines(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:

@@ -5,11 +5,9 @@ same smooth window. The window is a raised cosine of `width` seconds. It suppres
 stamps and white noise.
 """
 
-import weakref
-from collections import OrderedDict
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,9 +58,8 @@ def measurements(recording: Recording, quantity: str) -> dict[str, SignalArray]:
     return dict(sorted(found.items(), key=lambda item: (item[0] != quantity, item[0])))
 
 
-# Cache of the last results of `light`, valid while the arrays exist: seven checks use the same signals.
-_light: OrderedDict[tuple[int, int, str], tuple[weakref.ref[Any], weakref.ref[Any], SignalArray]] = OrderedDict()
-_CACHED_RECORDINGS = 32
+# results of `light` by array and quantity: seven checks use the same signals
+_light: WeakKeyDictionary[SignalArray, dict[str, SignalArray]] = WeakKeyDictionary()
 
 
 def light(array: SignalArray, quantity: str) -> SignalArray:
@@ -71,16 +68,10 @@ def light(array: SignalArray, quantity: str) -> SignalArray:
     Of samples with equal stamps the first is kept. At most `LONGEST_GRID_SECONDS` about the median stamp are kept; a
     few wrong stamps do not move the median. Angles are picked, not averaged, because they jump.
     """
-    key = (id(array.time), id(array.value), quantity)
-    known = _light.get(key)
-    if known is not None and known[0]() is array.time and known[1]() is array.value:
-        _light.move_to_end(key)
-        return known[2]
-    made = _lightened(array, quantity)
-    _light[key] = (weakref.ref(array.time), weakref.ref(array.value), made)
-    while len(_light) > _CACHED_RECORDINGS:
-        _light.popitem(last=False)
-    return made
+    known = _light.setdefault(array, {})
+    if quantity not in known:
+        known[quantity] = _lightened(array, quantity)
+    return known[quantity]
 
 
 def _lightened(array: SignalArray, quantity: str) -> SignalArray:

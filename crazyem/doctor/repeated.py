@@ -6,9 +6,9 @@ small as a few resolutions. Coarse signals that repeat together with a fine one 
 
 import numpy as np
 
-from crazyem.doctor.streams import COMMAND_SIGNALS, Stream, cadence, listed, places, runs, same_as_before, sole, streams
+from crazyem.doctor.streams import COMMAND_SIGNALS, Stream, cadence, listed, places, same_as_before, sole, streams
 from crazyem.recordings.airborne import Airtime, airtime
-from crazyem.recordings.finding import Finding, Fix, Grade, percent
+from crazyem.recordings.finding import Finding, Fix, Grade, percent, runs_of
 from crazyem.recordings.ordering import Array, Flags, inside, sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -134,7 +134,7 @@ def _finding(
 ) -> Finding:
     share = float(rows[considered].mean())
     rate = stored * (1.0 - share)
-    lengths = np.diff(runs(rows), axis=1)
+    lengths = np.diff(runs_of(rows), axis=1)
     what = "whole rows" if whole_table else "values"
     text = (
         f"{percent(share)} of the {what} of {listed(names)} in flight repeat the one before: "

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import cadence, listed, longest, runs
+from crazyem.doctor.streams import cadence, listed, longest
 from crazyem.recordings.airborne import airtime
-from crazyem.recordings.finding import Finding, Fix, Grade, intervals_of, percent
+from crazyem.recordings.finding import Finding, Fix, Grade, intervals_of, percent, runs_of
 from crazyem.recordings.ordering import Array, Flags, Intervals, inside, ordered
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -174,7 +174,7 @@ def _stopped(ratio: Array, rows: Flags) -> Flags:
     flags = np.zeros(ratio.size, bool)
     known = np.flatnonzero(np.isfinite(ratio))
     low = ratio[known] < STOPPED_RATIO
-    for first, last in runs(low):
+    for first, last in runs_of(low):
         neighbours = [k for k in (first - 1, last) if 0 <= k < known.size]
         if (ratio[known[neighbours]] > 0.5).any():
             flags[known[first:last]] = True

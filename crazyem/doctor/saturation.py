@@ -5,9 +5,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from crazyem.doctor.streams import longest, runs
+from crazyem.doctor.streams import longest
 from crazyem.recordings.airborne import Airtime, airtime
-from crazyem.recordings.finding import Finding, Grade, intervals_of, percent
+from crazyem.recordings.finding import Finding, Grade, intervals_of, percent, runs_of
 from crazyem.recordings.ordering import Array, Flags, Intervals, inside, ordered
 from crazyem.recordings.recording import Recording
 
@@ -80,7 +80,7 @@ def _is_ceiling(column: Array, top: float, rows: Flags) -> bool:
     """True if the largest value is a limit: too frequent, and too long at a time, for a maximum of a coarse signal."""
     at_top = (column == top) & rows
     count = int(at_top.sum())
-    spans = runs(at_top)
+    spans = runs_of(at_top)
     below = int(((column < top) & (column >= 0.97 * top) & rows).sum())
     often = count >= max(10, 0.002 * rows.sum()) and count > 0.5 * below
     return often and bool((spans[:, 1] - spans[:, 0]).max() >= _CEILING_RUN)

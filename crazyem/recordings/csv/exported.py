@@ -15,7 +15,6 @@ from crazyem.errors import FileFormatError
 from crazyem.recordings.columns import MARKED_COLUMN, Description, SignalEntry, name_and_unit
 from crazyem.recordings.contents import GrowingArray, ReadOptions
 from crazyem.recordings.csv.text import BLOCK_BYTES, LONGEST_LINE, Damage, text_blocks
-from crazyem.recordings.csv.wide import damage_notes
 from crazyem.recordings.export import HOST_TIME, METADATA_SUFFIX, TIME, from_json
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import Recording, SignalArray
@@ -200,7 +199,7 @@ class _Table:
             for batch in table.to_batches():
                 yield batch, first
                 first += batch.num_rows
-        self.findings += damage_notes(damage)
+        self.findings += damage.findings()
 
     def recording(self, held: _Held) -> Recording:
         """The recording from some consecutive rows."""

@@ -12,7 +12,6 @@ from crazyem.links.clock import StampUnwrapper
 from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.csv.mapping import CsvMapping, SignalColumns
 from crazyem.recordings.csv.text import Damage, Header, parse_fields, text_blocks, to_number
-from crazyem.recordings.csv.wide import damage_notes
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.recording import Recording, SignalArray
@@ -51,7 +50,7 @@ def read_long(path: Path, header: Header, mapping: CsvMapping, options: ReadOpti
     if not tables:
         raise FileFormatError(f"{path}: there is a header but not a single sample.")
     torn = sum(most.values()) - sum(most[key] for key in layouts.items())
-    findings: list[Finding] = damage_notes(damage)
+    findings: list[Finding] = damage.findings()
     if torn:
         text = f"{torn} packets were incomplete and were dropped."
         grade = Grade.DEGRADES if 100 * torn > sum(most.values()) else Grade.HARMLESS

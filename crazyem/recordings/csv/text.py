@@ -9,19 +9,19 @@ import gzip
 import io
 import math
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.csv
 from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings.columns import unique_name
+from crazyem.recordings.finding import Finding, Grade, note
 
 BLOCK_BYTES = 4 << 20
 LONGEST_LINE = 1 << 20  # bytes
@@ -60,6 +60,24 @@ class Damage:
         """Raise FileFormatError if more than 1 % of the lines so far are damaged (another kind of file)."""
         if 100 * self.dropped > self.rows + self.dropped:
             raise FileFormatError(f"{path}: {self.first}.")
+
+    def findings(self, names: Sequence[str] = ()) -> list[Finding]:
+        """Findings about damaged lines and fields of a file whose columns have these names."""
+        notes = []
+        if self.dropped:
+            where = ", ".join(map(str, self.lines)) + (", ..." if self.dropped > len(self.lines) else "")
+            text = f"{self.dropped} damaged lines were dropped (line {where}): {self.first}."
+            notes.append(note("integrity", text, Grade.DEGRADES, lines=float(self.dropped)))
+        if self.cut_gzip:
+            text = "The gzip file ends early; what was packed before its end was read."
+            notes.append(note("integrity", text, Grade.DEGRADES))
+        if self.cut_line and not self.cut_gzip:
+            notes.append(note("integrity", "The last line is cut short and was dropped."))
+        for column, count in self.words.items():
+            notes.append(
+                note("integrity", f"{count} values in column {names[column]} are no numbers.", count=float(count))
+            )
+        return notes
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +241,7 @@ def _chunk(source: IO[bytes], size: int, packed: bool) -> tuple[bytes, bool]:
 def _fast(block: bytes, header: Header, columns: tuple[int, ...]) -> Columns | None:
     """The block parsed by pyarrow; None if pyarrow fails or the number of rows differs from that of lines."""
     names = [str(i) for i in range(len(header.names))]
-    types = {str(c): pa.string() if c in header.flags else pa.float64() for c in columns}
+    types = {str(c): pa.bool_() if c in header.flags else pa.float64() for c in columns}
     try:
         table = pyarrow.csv.read_csv(
             pa.BufferReader(block),
@@ -234,6 +252,8 @@ def _fast(block: bytes, header: Header, columns: tuple[int, ...]) -> Columns | N
                 column_types=types,
                 include_columns=[str(c) for c in columns],
                 null_values=_NULLS,
+                true_values=["true", "True", "TRUE"],
+                false_values=["false", "False", "FALSE"],
                 strings_can_be_null=True,
                 decimal_point=header.decimal,
             ),
@@ -242,29 +262,7 @@ def _fast(block: bytes, header: Header, columns: tuple[int, ...]) -> Columns | N
         return None
     if table.num_rows != block.count(b"\n"):
         return None
-    result = {}
-    for c in columns:
-        column = table.column(str(c))
-        if c in header.flags:
-            value = _flags(column)
-            if value is None:
-                return None
-            result[c] = value
-        else:
-            result[c] = column.to_numpy()
-    return result
-
-
-def _flags(column: pa.ChunkedArray) -> NDArray[np.float64] | None:
-    """1 and 0 for true and false, NaN for empty fields; None if there are other words."""
-    try:
-        low = pc.utf8_lower(pc.utf8_trim_whitespace(column))
-    except pa.ArrowException:
-        return None
-    true, false = pc.equal(low, "true"), pc.equal(low, "false")
-    if pc.any(pc.and_(pc.invert(true), pc.invert(false))).as_py():
-        return None
-    return pc.cast(true, pa.float64()).to_numpy()
+    return {c: table.column(str(c)).cast(pa.float64()).to_numpy() for c in columns}
 
 
 def _careful(

@@ -5,8 +5,7 @@ NUL, number of variables u16, and their names "group.variable(T)" ending in NUL,
 Records follow: id u16, time stamp (version 1: u32 ms; version 2, since 2021-03-18: u64 us), packed values. The last 4
 bytes are the CRC-32 of everything before them. Source: src/deck/drivers/src/usddeck.c of crazyflie-firmware.
 
-Only the id of a record gives its length, so the records must be located one after the other. Most logs have long runs
-of one kind; one comparison locates a whole run. Alternating kinds need a plain loop (0.3 us per record).
+Only the id of a record gives its length, so the records must be located one after the other (0.3 us per record).
 """
 
 from array import array
@@ -154,9 +153,6 @@ class _Cursor:
 
 
 BLANK_BYTES = (b"\xff", b"\x00")  # erased flash; reserved clusters that were never written
-_RUN_RECORDS = 16  # consecutive records of one kind before a run is tested
-_WINDOW_RECORDS = 1 << 16  # most records in one comparison; bounds its memory
-_GATHERED_BYTES = 1 << 22  # memory [bytes] for one copy of records that are not adjacent
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,12 +162,14 @@ class Records:
     Attributes:
         start: (n,) first byte of each record.
         kind: (n,) index of the event type of each record.
+        order: rows of each kind among these records.
         stop: byte after the last whole record.
         unknown: the event id found at `stop`, None if the data end there.
     """
 
     start: NDArray[np.int64]
     kind: NDArray[np.uint16]
+    order: list[NDArray[np.intp]]
     stop: int
     unknown: int | None
 
@@ -181,64 +179,29 @@ def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int, bla
 
     Records that begin at byte `blank` or later are left out: erased flash looks like records of event 0xFFFF.
     """
-    sizes = {event.identifier.to_bytes(2, "little"): event.layout.itemsize for event in events}
-    start = array("q")
-    append = start.append
-    at, previous, streak = begin, b"", 0
-    while True:
-        identifier = data[at : at + 2]
-        size = sizes.get(identifier)
-        if size is None or at + size > end:
+    known = {event.identifier.to_bytes(2, "little"): (k, event.layout.itemsize) for k, event in enumerate(events)}
+    start, kind = array("q"), array("H")
+    at = begin
+    while at < blank:
+        k, size = known.get(data[at : at + 2], (0, end))
+        if at + size > end:
             break
-        if identifier != previous:
-            previous, streak = identifier, 0
-        streak += 1
-        if streak < _RUN_RECORDS:
-            append(at)
-            at += size
-            continue
-        run = _run(data, at, end, size, int.from_bytes(identifier, "little"))
-        start.frombytes(np.arange(at, at + run * size, size, dtype=np.int64).tobytes())
-        at += run * size
-        streak = _RUN_RECORDS - 1 if run == _WINDOW_RECORDS else 0  # full window: the run may continue
-    starts = np.frombuffer(start, np.int64)
-    unknown = int.from_bytes(identifier, "little") if size is None and at + 2 <= end else None
-    count = int(np.searchsorted(starts, blank))
-    if count < starts.size:
-        starts, at, unknown = starts[:count], int(starts[count]), None
-    return Records(starts, _kinds(data, events, starts), at, unknown)
-
-
-def _kinds(data: bytes, events: tuple[EventType, ...], start: NDArray[np.int64]) -> NDArray[np.uint16]:
-    """(n,) index of the event type of each record."""
-    kinds = np.zeros(start.size, np.uint16)
-    if len(events) > 1:
-        source = np.frombuffer(data, np.uint8)
-        identifiers = source[start] | source[start + 1].astype(np.uint16) << 8
-        for i, event in enumerate(events):
-            kinds[identifiers == event.identifier] = i
-    return kinds
-
-
-def _run(data: bytes, at: int, end: int, size: int, identifier: int) -> int:
-    """Length of the run of whole records of one kind that starts at `at`, at most a window."""
-    count = min((end - at) // size, _WINDOW_RECORDS)
-    same = np.ndarray((count,), "<u2", data, at, (size,)) == identifier
-    return count if same.all() else int(np.argmin(same))
+        start.append(at)
+        kind.append(k)
+        at += size
+    unknown = data[at : at + 2] not in known and at + 2 <= end
+    kinds = np.frombuffer(kind, np.uint16)
+    order = [np.flatnonzero(kinds == k) for k in range(len(events))]
+    identifier = int.from_bytes(data[at : at + 2], "little") if unknown else None
+    return Records(np.frombuffer(start, np.int64), kinds, order, at, identifier)
 
 
 def gather(data: bytes, event: EventType, start: NDArray[np.int64]) -> NDArray[np.void]:
-    """(n,) records of one kind; a view of `data` if they are adjacent, else a copy."""
-    size = event.layout.itemsize
-    if start.size and int(start[-1]) - int(start[0]) == (start.size - 1) * size:
-        return np.frombuffer(data, event.layout, start.size, int(start[0]))
-    source = np.frombuffer(data, np.uint8)
-    result = np.empty((start.size, size), np.uint8)
-    step = max(1, _GATHERED_BYTES // (8 * size))
-    for first in range(0, start.size, step):
-        rows = start[first : first + step]
-        result[first : first + step] = source[rows[:, None] + np.arange(size)]
-    return result.reshape(-1).view(event.layout)
+    """(n,) records of one kind, copied."""
+    if not start.size:
+        return np.empty(0, event.layout)
+    windows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(data, np.uint8), event.layout.itemsize)
+    return windows[start].reshape(-1).view(event.layout)
 
 
 class Clock:

@@ -25,25 +25,14 @@ Packed = list[NDArray[np.void]]  # records of each kind
 _Piece = tuple[NDArray[np.float64], NDArray[np.uint16], Packed]  # times and kinds in file order, records of each kind
 
 
-@dataclass(frozen=True, slots=True)
-class Checksum:
-    """The last four bytes against the CRC-32 of everything before them; None where the file has no room for one."""
-
-    stored: int | None
-    computed: int | None
-
-    @property
-    def right(self) -> bool:
-        return self.stored is not None and self.stored == self.computed
-
-
 class Survey:
     """Result of a pass over the whole file, without its records.
 
     Attributes:
         header: of the file.
         size: of the file, unpacked [bytes].
-        checksum: of the file.
+        stored, computed: the last four bytes, and the CRC-32 of everything before them.
+        right: whether they are equal, and the file has room for them.
         blank: first byte of the unwritten end: of the run of one of `BLANK_BYTES` that ends the file.
         stop, unknown: end of the last whole record and the event id there, as in `Records`.
         counts: number of records of each kind.
@@ -68,14 +57,14 @@ class Survey:
             computed = zlib.crc32(memoryview(tail)[:-CRC_BYTES], computed)
             tail = tail[-CRC_BYTES:]
         room = self.size >= self.header.size + CRC_BYTES
-        self.checksum = Checksum(int.from_bytes(tail, "little"), computed) if room else Checksum(None, None)
-        self.blank = self.size if self.checksum.right else min(blanks.values())
+        self.stored, self.computed = int.from_bytes(tail, "little"), computed
+        self.right = room and self.stored == self.computed
+        self.blank = self.size if self.right else min(blanks.values())
         for begin, data, records in _walk(self):
             self.stop, self.unknown = begin + records.stop, records.unknown
-            order = [np.flatnonzero(records.kind == kind) for kind in range(len(self.counts))]
             for k, sample in samples.items():
-                sample.add(gather(data, self.header.events[k], records.start[order[k]]))
-            self.counts = [n + rows.size for n, rows in zip(self.counts, order, strict=True)]
+                sample.add(gather(data, self.header.events[k], records.start[records.order[k]]))
+            self.counts = [n + rows.size for n, rows in zip(self.counts, records.order, strict=True)]
         self._samples = {k: sample.rows(self.header.events[k].layout) for k, sample in samples.items()}
 
     def integrity(self, *, last: float) -> tuple[str, list[Finding]]:
@@ -84,19 +73,19 @@ class Survey:
         Args:
             last: time of the last record [s].
         """
-        stop, unknown, checksum = self.stop, self.unknown, self.checksum
-        left = self.size - stop - (CRC_BYTES if checksum.right else 0)
-        if checksum.right and not left:
+        stop, unknown, right = self.stop, self.unknown, self.right
+        left = self.size - stop - (CRC_BYTES if right else 0)
+        if right and not left:
             return "ok", []
         evidence = {"offset_bytes": float(stop), "left_bytes": float(left), "last_s": last}
         verdict, grade, advice = "missing", Grade.HARMLESS, ""
-        if not checksum.right and self.blank <= stop and left > CRC_BYTES:
+        if not right and self.blank <= stop and left > CRC_BYTES:
             text = (
                 f"From byte {stop} on there are only bytes that nobody wrote (0xFF of erased flash, or 0): "
                 f"{left} bytes were not read (the last record read is at {last:.3f} s; power lost while logging?)."
             )
-        elif checksum.right or (unknown is not None and left > CRC_BYTES):
-            verdict, grade = "ok" if checksum.right else "wrong", Grade.DEGRADES
+        elif right or (unknown is not None and left > CRC_BYTES):
+            verdict, grade = "ok" if right else "wrong", Grade.DEGRADES
             advice = "Copy the file from the card again; what stands before the place named was read."
             what = "is cut off" if unknown is None else f"is of the unknown event {unknown}"
             text = (
@@ -105,9 +94,9 @@ class Survey:
             )
         elif left == CRC_BYTES and unknown is not None:  # four bytes that start no record are a checksum
             verdict, grade, advice = "wrong", Grade.DEGRADES, "Copy the file from the card again."
-            evidence = {"stored": float(checksum.stored or 0), "computed": float(checksum.computed or 0)}
+            evidence = {"stored": float(self.stored), "computed": float(self.computed)}
             text = (
-                f"The CRC is wrong: the file says {checksum.stored:08x}, its bytes give {checksum.computed:08x}; "
+                f"The CRC is wrong: the file says {self.stored:08x}, its bytes give {self.computed:08x}; "
                 "at least one byte is not what was written."
             )
         else:
@@ -174,7 +163,7 @@ def stretches(survey: Survey, seconds: float, largest: float = STRETCH_BYTES) ->
     held: list[_Piece] = []
     rows = 0
     for _, data, records in _walk(survey):
-        order = [np.flatnonzero(records.kind == kind) for kind in range(len(header.events))]
+        order = records.order
         packed = [gather(data, e, records.start[r]) for e, r in zip(header.events, order, strict=True)]
         time = clock.seconds(order, [p["stamp"] for p in packed])
         at = 0
@@ -215,7 +204,7 @@ def _joined(header: Header, held: list[_Piece], first: int, ends: bool) -> Stret
 def _walk(survey: Survey) -> Iterator[tuple[int, bytes, Records]]:
     """For each piece of the file: (its offset, its bytes, the whole records in it)."""
     header = survey.header
-    end = survey.size - (CRC_BYTES if survey.checksum.right else 0)
+    end = survey.size - (CRC_BYTES if survey.right else 0)
     data, begin = b"", 0  # a piece of the file and its offset
     skip = header.size
     for piece in pieces(survey.path, _READ_BYTES):
