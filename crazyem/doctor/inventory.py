@@ -13,7 +13,7 @@ from crazyem.notebook import finite
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.finding import percent
 from crazyem.recordings.ordering import sound_rows
-from crazyem.recordings.recording import Recording, SignalArray
+from crazyem.recordings.recording import Recording, SignalArray, about
 from crazyem.recordings.thrust import kind_objection, vehicle_for, weight_objection
 from crazyem.vehicle import Vehicle
 
@@ -146,12 +146,7 @@ def _row(name: str, array: SignalArray) -> SignalRow:
     bad = ~sound_rows(array.value)
     return SignalRow(
         name=name,
-        quantity=array.quantity,
-        unit=array.unit,
-        frame=array.frame,
-        clock=array.clock,
-        stream=array.stream,
-        source=array.source,
+        **about(array),
         samples=n,
         start_s=float(time.min()) if time.size else None,
         end_s=float(time.max()) if time.size else None,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.recordings.finding import Finding
-from crazyem.recordings.recording import Event, Recording, SignalArray
+from crazyem.recordings.recording import Event, Recording, SignalArray, about
 
 # Units of the components where they differ within a signal.
 _MIXED_UNITS: dict[str, tuple[str, ...]] = {"wrench_command": ("N", "N m", "N m", "N m")}
@@ -49,17 +49,7 @@ def entry_of(name: str, array: SignalArray) -> SignalEntry:
     """The entry of a signal."""
     count = array.value.shape[1]
     parts = array.components if len(array.components) == count else tuple(str(i) for i in range(count))
-    return SignalEntry(
-        name,
-        ("",) if count == 1 else parts,
-        array.quantity,
-        array.unit,
-        array.frame,
-        array.clock,
-        array.stream,
-        array.source,
-        bool(array.marked.any()),
-    )
+    return SignalEntry(name, ("",) if count == 1 else parts, **about(array), marked=bool(array.marked.any()))
 
 
 @dataclass(frozen=True, slots=True)

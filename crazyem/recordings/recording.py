@@ -74,6 +74,11 @@ class SignalArray:
         )
 
 
+def about(signal: Any) -> dict[str, Any]:
+    """What is known of a signal, from a `SignalArray` or an object with the same attributes."""
+    return {name: getattr(signal, name) for name in ("quantity", "unit", "frame", "clock", "stream", "source")}
+
+
 @dataclass(frozen=True, slots=True)
 class Event:
     """An event in the flight: a setpoint, a write of a parameter, an estimate or a log message.

@@ -1,6 +1,7 @@
 """Signals from topics (named rows of numbers with times); shared by the readers of ULog, tlog and rosbag2."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -37,6 +38,18 @@ class Topic:
     host_time: NDArray[np.float64] | None = None
     clock: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
+
+    def source_of(self, column: str) -> str:
+        """The name of a column in the file."""
+        return f"{self.name}.{column}"
+
+    def raw_name(self, column: str, *, ambiguous: bool) -> str:
+        """The name of the signal of a column without a meaning; `ambiguous`: another topic has such a column, too."""
+        return self.source_of(column)
+
+    def unit_of(self, column: str) -> str:
+        """The unit of a column, "" where unknown."""
+        return self.units.get(column, "")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,58 +168,53 @@ def ranks(times: Sequence[NDArray[np.generic]]) -> list[NDArray[np.int64]]:
     return np.split(place, np.cumsum(sizes)[:-1]) if times else []
 
 
-def signals_of(topics: Sequence[Topic], mapped: Sequence[Mapped]) -> tuple[dict[str, SignalArray], list[Finding]]:
+def signals_of(
+    topics: Sequence[Topic], mapped: Sequence[Mapped], *, bounded: bool = True
+) -> tuple[dict[str, SignalArray], list[Finding]]:
     """Signals by name, and findings about columns that were left out.
 
     Args:
         topics: all of the recording.
         mapped: best first; the first of a quantity gets its name, the others are called "<quantity>@<topic>".
+        bounded: leave out columns without a meaning beyond `MOST_RAW_SIGNALS` and `MOST_RAW_SAMPLES`.
 
-    Returns: first the signals of the vocabulary, then every unused column as "<topic>.<column>"; and the findings.
+    Returns: first the signals of the vocabulary, then every unused column by `Topic.raw_name`; and the findings.
     """
-    mapped = [m for m in mapped if m.topic.time.size]
+    mapped = [m for m in mapped if m.topic.time.size or not bounded]
     used = {(id(m.topic), column) for m in mapped for column in m.columns}
-    raw, left_out = _within_bounds([(t, c) for t in topics for c in t.columns if (id(t), c) not in used])
-    step = len(mapped) + len(raw)  # places for all signals of a row, so that orders are unique
-    unmarked = {id(t): np.zeros(t.time.size, bool) for t in topics}
+    raw = [(t, c) for t in topics for c in t.columns if (id(t), c) not in used]
+    raw, left_out = _within_bounds(raw) if bounded else (raw, [])
+    # places for all signals of a row, so that orders are unique; unbounded columns without a meaning share one place,
+    # to save memory
+    step = len(mapped) + (len(raw) if bounded else 1)
     hosts = {id(t): np.full(t.time.size, np.nan) if t.host_time is None else t.host_time for t in topics}
+    unmarked = {id(t): np.zeros(t.time.size, bool) for t in topics}
+    shared = {id(t): t.order * step + len(mapped) for t in topics if not bounded}
     found: dict[str, SignalArray] = {}
     for place, m in enumerate(mapped):
+        topic, (_, unit, frame) = m.topic, SIGNALS[m.quantity]
         name = f"{m.quantity}@{m.origin}" if m.origin else m.quantity
-        if name in found:
-            name = f"{m.quantity}@{m.topic.name}"
-        while name in found:
-            name += "'"
-        found[name] = SignalArray(
-            m.topic.time,
-            m.value,
-            m.topic.order * step + place,
-            hosts[id(m.topic)],
-            unmarked[id(m.topic)] if m.marked is None else m.marked & ~np.isfinite(m.value).all(axis=1),
-            quantity=m.quantity,
-            unit=SIGNALS[m.quantity][1],
-            frame=m.frame or SIGNALS[m.quantity][2],
-            clock=m.topic.clock,
-            stream=m.topic.name,
-            source=tuple(f"{m.topic.name}.{c}" for c in m.columns),
-        )
+        name = _unique(f"{m.quantity}@{topic.name}" if name in found else name, found)
+        marked = unmarked[id(topic)] if m.marked is None else m.marked & ~np.isfinite(m.value).all(axis=1)
+        order, source = topic.order * step + place, tuple(map(topic.source_of, m.columns))
+        about = (m.quantity, unit, m.frame or frame, topic.clock, topic.name, source)
+        found[name] = SignalArray(topic.time, m.value, order, hosts[id(topic)], marked, *about)
     signals = {name: found[name] for name in sorted(found, key=lambda name: list(SIGNALS).index(name.split("@")[0]))}
+    times = Counter(column for _, column in raw)
     for place, (topic, column) in enumerate(raw, start=len(mapped)):
-        name = f"{topic.name}.{column}"
-        while name in signals:  # two topics of one name: in damaged files, or "a_1" beside the second "a"
-            name += "'"
-        signals[name] = SignalArray(
-            topic.time,
-            floats(topic.columns[column])[:, None],
-            topic.order * step + place,
-            hosts[id(topic)],
-            unmarked[id(topic)],
-            unit=topic.units.get(column, ""),
-            clock=topic.clock,
-            stream=topic.name,
-            source=(f"{topic.name}.{column}",),
-        )
+        # two topics of one name: in damaged files, or "a_1" beside the second "a"
+        name = _unique(topic.raw_name(column, ambiguous=times[column] > 1), signals)
+        value, key = floats(topic.columns[column])[:, None], id(topic)
+        about = ("", topic.unit_of(column), "", topic.clock, topic.name, (topic.source_of(column),))
+        order = topic.order * step + place if bounded else shared[key]
+        signals[name] = SignalArray(topic.time, value, order, hosts[key], unmarked[key], *about)
     return signals, left_out
+
+
+def _unique(name: str, taken: Container[str]) -> str:
+    while name in taken:
+        name += "'"
+    return name
 
 
 def _within_bounds(raw: list[tuple[Topic, str]]) -> tuple[list[tuple[Topic, str]], list[Finding]]:

@@ -17,7 +17,7 @@ from crazyem.recordings.contents import GrowingArray, ReadOptions
 from crazyem.recordings.csv.text import BLOCK_BYTES, LONGEST_LINE, Damage, text_blocks
 from crazyem.recordings.export import HOST_TIME, METADATA_SUFFIX, TIME, from_json
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.recording import Recording, SignalArray
+from crazyem.recordings.recording import Recording, SignalArray, about
 from crazyem.signals.sample import SIGNALS, components
 
 _LARGEST_DESCRIPTION = 256 << 20  # bytes
@@ -103,19 +103,8 @@ class _Held:
             if known is None:
                 known = (order, place, self._of(self.time, order), self._of(self.host_time, order))
                 shared.append(known)
-            signals[entry.name] = SignalArray(
-                known[2],
-                self.value[place].rows,
-                order,
-                known[3],
-                self.marked[place].rows,
-                quantity=entry.quantity,
-                unit=entry.unit,
-                frame=entry.frame,
-                clock=entry.clock,
-                stream=entry.stream,
-                source=entry.source,
-            )
+            value, marked = self.value[place].rows, self.marked[place].rows
+            signals[entry.name] = SignalArray(known[2], value, order, known[3], marked, **about(entry))
         return signals
 
     def _of(self, stamps: GrowingArray, order: NDArray[np.int64]) -> Floats:

@@ -67,17 +67,11 @@ class _BlockChannel:
     rows: _Rows
 
     def table(self) -> Table:
-        names = [v.name for v in self.block.variables]
         (stamp, host_time, values), places = self.rows.take()
-        return Table(
-            name=f"log/{self.block.identifier}",
-            columns={name: values[:, i] for i, name in enumerate(names)},
-            time=stamp[:, 0] / 1000.0,
-            order=places,
-            host_time=host_time[:, 0],
-            clock="firmware",
-            ctypes={v.name: v.ctype for v in self.block.variables},
-        )
+        ctypes = {v.name: v.ctype for v in self.block.variables}
+        columns = {v.name: values[:, i] for i, v in enumerate(self.block.variables)}
+        name = f"log/{self.block.identifier}"
+        return Table(name, columns, stamp[:, 0] / 1000.0, places, host_time[:, 0], ctypes=ctypes)
 
 
 @dataclass
@@ -94,19 +88,9 @@ class _StreamChannel:
         time, host_time, marked = (column[back] for column in fixed[:3])
         found = []
         for bit, column in enumerate(self.layout.signals):
-            array = SignalArray(
-                time,
-                values[bit][back],
-                (place + bit)[back],
-                host_time,
-                (marked & np.uint64(1 << bit)) != 0,
-                quantity=column.quantity,
-                unit=column.unit,
-                frame=column.frame,
-                clock=column.clock,
-                stream=self.layout.stream,
-                source=column.source,
-            )
+            marks = (marked & np.uint64(1 << bit)) != 0
+            known = (column.quantity, column.unit, column.frame, column.clock, self.layout.stream, column.source)
+            array = SignalArray(time, values[bit][back], (place + bit)[back], host_time, marks, *known)
             found.append((column.index, column.name, array))
         return found
 
@@ -243,15 +227,10 @@ def join(sessions: Iterable[Mapping[str, SignalArray]]) -> dict[str, SignalArray
 
 
 def _appended(a: SignalArray, b: SignalArray) -> SignalArray:
-    stream = a.stream if a.stream == b.stream else f"{a.stream}, {b.stream}"
     width = min(a.value.shape[1], b.value.shape[1])
-    return replace(
-        a,
-        time=np.concatenate([a.time, b.time]),
-        value=np.concatenate([a.value[:, :width], b.value[:, :width]]),
-        order=np.concatenate([a.order, b.order]),
-        host_time=np.concatenate([a.host_time, b.host_time]),
-        marked=np.concatenate([a.marked, b.marked]),
-        stream=stream,
-        source=tuple(dict.fromkeys((*a.source, *b.source))) if a.source != b.source else a.source,
-    )
+    rows: dict[str, Any] = {
+        n: np.concatenate([getattr(a, n), getattr(b, n)]) for n in ("time", "order", "host_time", "marked")
+    }
+    rows["value"] = np.concatenate([a.value[:, :width], b.value[:, :width]])
+    stream = a.stream if a.stream == b.stream else f"{a.stream}, {b.stream}"
+    return replace(a, **rows, stream=stream, source=tuple(dict.fromkeys((*a.source, *b.source))))
