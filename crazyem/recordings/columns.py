@@ -20,23 +20,17 @@ MARKED_COLUMN = "marked"
 
 @dataclass(frozen=True, slots=True)
 class SignalEntry:
-    """All that is known of a signal besides its samples (see `SignalArray`).
+    """All that is known of a signal besides its samples (see `SignalArray`)."""
 
-    Attributes:
-        name: in the recording.
-        components: their names, ("",) for a scalar.
-        marked: True if some of its samples are marked.
-    """
-
-    name: str
-    components: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
+    name: str  # in the recording
+    components: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]  # their names, ("",) for a scalar
     quantity: str
     unit: str
     frame: str
     clock: str
     stream: str
     source: tuple[str, ...]
-    marked: bool = False
+    marked: bool = False  # True if some of its samples are marked
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -54,17 +48,11 @@ def entry_of(name: str, array: SignalArray) -> SignalEntry:
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """All that a recording holds besides samples; of a recording in parts: of all parts together.
+    """All that a recording holds besides samples; of a recording in parts: of all parts together."""
 
-    Attributes:
-        source: as in `Recording`.
-        entries: one a signal, in the order of the recording.
-        origin, metadata, findings, events: as in `Recording`.
-    """
-
-    source: str
-    entries: tuple[SignalEntry, ...]
-    origin: float = 0.0
+    source: str  # as in `Recording`
+    entries: tuple[SignalEntry, ...]  # one a signal, in the order of the recording
+    origin: float = 0.0  # origin, metadata, findings, events: as in `Recording`
     metadata: dict[str, dict[str, str]] | None = None
     findings: tuple[Finding, ...] = ()
     events: tuple[Event, ...] = ()
@@ -88,19 +76,12 @@ class Description:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column of the table.
+    """A column of the table."""
 
-    Attributes:
-        name: unique, printable, without unit: "position_x", "voltage", "position_marked".
-        unit: of its numbers.
-        entry: the signal.
-        component: number of the component; None for the flag of marked samples.
-    """
-
-    name: str
-    unit: str
-    entry: SignalEntry
-    component: int | None
+    name: str  # unique, printable, without unit: "position_x", "voltage", "position_marked"
+    unit: str  # of its numbers
+    entry: SignalEntry  # the signal
+    component: int | None  # number of the component; None for the flag of marked samples
 
     @property
     def title(self) -> str:
@@ -146,19 +127,12 @@ def describe(parts: Iterable[Recording]) -> Description:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """Consecutive rows of a table: runs of samples, in processing order, with one stamp and one host time.
+    """Consecutive rows of a table: runs of samples, in processing order, with one stamp and one host time."""
 
-    Attributes:
-        time: (r,) s.
-        host_time: (r,) s since the epoch, NaN where unknown.
-        row: signal -> (n,) row of each of its samples, ascending.
-        sample: signal -> (n,) number of that sample in its array.
-    """
-
-    time: NDArray[np.float64]
-    host_time: NDArray[np.float64]
-    row: dict[str, NDArray[np.int64]]
-    sample: dict[str, NDArray[np.int64]]
+    time: NDArray[np.float64]  # (r,) s
+    host_time: NDArray[np.float64]  # (r,) s since the epoch, NaN where unknown
+    row: dict[str, NDArray[np.int64]]  # signal -> (n,) row of each of its samples, ascending
+    sample: dict[str, NDArray[np.int64]]  # signal -> (n,) number of that sample in its array
 
 
 def rows_of(recording: Recording, names: Iterable[str], *, samples: int = 1 << 16) -> Iterator[Rows]:

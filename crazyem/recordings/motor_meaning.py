@@ -48,19 +48,14 @@ _MEANING_NAMES = {"duty": "the PWM sent, after battery compensation", "request":
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Meaning:
-    """The meaning of motor.m1..4.
+    """The meaning of motor.m1..4."""
 
-    Attributes:
-        meaning: "duty" (PWM sent, after battery compensation), "request" (thrust asked for, before compensation), or
-            None without evidence or without motor.m1..4.
-        reason: why, one sentence; "" without motor.m1..4.
-        evidence: the numbers that support it.
-        findings: for the `findings` of the recording: the decision, a question to the user, or a contradiction.
-    """
-
+    # "duty" (PWM sent, after battery compensation), "request" (thrust asked for, before compensation), or None without
+    # evidence or without motor.m1..4
     meaning: str | None
-    reason: str = ""
-    evidence: Mapping[str, float] = field(default_factory=dict)
+    reason: str = ""  # why, one sentence; "" without motor.m1..4
+    evidence: Mapping[str, float] = field(default_factory=dict)  # the numbers that support it
+    # for the `findings` of the recording: the decision, a question to the user, or a contradiction
     findings: tuple[Finding, ...] = ()
 
     @property

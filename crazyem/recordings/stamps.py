@@ -32,21 +32,13 @@ STAMP_CHECK = "stamps"
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Impossible stamps of one stream.
+    """Impossible stamps of one stream."""
 
-    Attributes:
-        stream: its name.
-        count: number of records with such stamps.
-        total: number of records of the stream.
-        what: treatment of these records: "left out", "placed by arrival" or "shifted".
-        example: one of the stamps [s], as in the file; for "shifted": the shift [s].
-    """
-
-    stream: str
-    count: int
-    total: int
-    what: str
-    example: float
+    stream: str  # its name
+    count: int  # number of records with such stamps
+    total: int  # number of records of the stream
+    what: str  # treatment of these records: "left out", "placed by arrival" or "shifted"
+    example: float  # one of the stamps [s], as in the file; for "shifted": the shift [s]
 
 
 def impossible(time: Column, *, centre: float | None = None, absent: float | None = None) -> Flags:

@@ -16,14 +16,10 @@ MOTOR_MEANINGS = ("duty", "request")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table(Topic):
-    """Rows of firmware variables that were sampled together: a log block, a uSD event, a topic.
-
-    Attributes:
-        ctypes: firmware variable -> C type, where known.
-    """
+    """Rows of firmware variables that were sampled together: a log block, a uSD event, a topic."""
 
     clock: str = "firmware"
-    ctypes: Mapping[str, str] = field(default_factory=dict)
+    ctypes: Mapping[str, str] = field(default_factory=dict)  # firmware variable -> C type, where known
 
     def source_of(self, column: str) -> str:
         """The variable."""

@@ -19,25 +19,15 @@ LONGEST_TEXT = 300  # characters of a metadata value that are kept
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Topic:
-    """Messages of one kind.
+    """Messages of one kind."""
 
-    Attributes:
-        name: becomes the `stream` of its signals; raw columns are called "<name>.<column>".
-        columns: column -> (n,) numbers, in the type in which they were stored.
-        time: (n,) s, on the time axis of the recording.
-        order: (n,) position of each row among the rows of all topics; a number occurs once.
-        host_time: (n,) s since the epoch, None where unknown.
-        clock: as in `SignalArray`.
-        units: column -> unit, where known.
-    """
-
-    name: str
-    columns: Mapping[str, NDArray[np.generic]]
-    time: NDArray[np.float64]
-    order: NDArray[np.int64]
-    host_time: NDArray[np.float64] | None = None
-    clock: str = ""
-    units: Mapping[str, str] = field(default_factory=dict)
+    name: str  # becomes the `stream` of its signals; raw columns are called "<name>.<column>"
+    columns: Mapping[str, NDArray[np.generic]]  # column -> (n,) numbers, in the type in which they were stored
+    time: NDArray[np.float64]  # (n,) s, on the time axis of the recording
+    order: NDArray[np.int64]  # (n,) position of each row among the rows of all topics; a number occurs once
+    host_time: NDArray[np.float64] | None = None  # (n,) s since the epoch, None where unknown
+    clock: str = ""  # as in `SignalArray`
+    units: Mapping[str, str] = field(default_factory=dict)  # column -> unit, where known
 
     def source_of(self, column: str) -> str:
         """The name of a column in the file."""
@@ -54,47 +44,33 @@ class Topic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mapped:
-    """A signal of the vocabulary, made from columns of a topic.
+    """A signal of the vocabulary, made from columns of a topic."""
 
-    Attributes:
-        quantity: key of `SIGNALS`.
-        value: (n, c) SI.
-        columns: names of the source columns.
-        marked: (n,) True where the reader set NaN because the file says that the value is invalid; None: nowhere.
-        frame: the frame, if known better than in `SIGNALS`.
-        origin: "" for a candidate for the signal itself, a name such as "mocap" for a further measurement.
-    """
-
-    quantity: str
+    quantity: str  # key of `SIGNALS`
     topic: Topic
-    value: NDArray[np.float64]
-    columns: tuple[str, ...]
+    value: NDArray[np.float64]  # (n, c) SI
+    columns: tuple[str, ...]  # names of the source columns
+    # (n,) True where the reader set NaN because the file says that the value is invalid; None: nowhere
     marked: NDArray[np.bool_] | None = None
-    frame: str = ""
-    origin: str = ""
+    frame: str = ""  # the frame, if known better than in `SIGNALS`
+    origin: str = ""  # "" for a candidate for the signal itself, a name such as "mocap" for a further measurement
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Which columns of a topic give a signal of the vocabulary; a reader has a table of these, the best source first.
-
-    Attributes:
-        convert: function from c columns of (n,) to (n, c) SI.
-        invalid: function that returns (n,) True in rows that the message declares invalid; they become missing.
-        absent_is_nan: the format uses NaN for "no value".
-        zero_is_absent: 0 in every row means that no sensor is connected; the columns then stay raw.
-        frame, origin: as in `Mapped`.
-    """
+    """Which columns of a topic give a signal of the vocabulary; a reader has a table of these, the best first."""
 
     quantity: str
     topic: str
     columns: tuple[str, ...]
+    # function from c columns of (n,) to (n, c) SI
     convert: Callable[[Sequence[NDArray[np.generic]]], NDArray[np.float64]]
+    # function that returns (n,) True in rows that the message declares invalid; they become missing
     invalid: Callable[[Topic], NDArray[np.bool_]] | None = None
-    absent_is_nan: bool = False
-    frame: str = ""
+    absent_is_nan: bool = False  # the format uses NaN for "no value"
+    frame: str = ""  # frame, origin: as in `Mapped`
     origin: str = ""
-    zero_is_absent: bool = False
+    zero_is_absent: bool = False  # 0 in every row means that no sensor is connected; the columns then stay raw
 
     def of(self, topics: Sequence[Topic]) -> Iterator[Mapped]:
         """The signal, from each topic that has the name and the columns."""

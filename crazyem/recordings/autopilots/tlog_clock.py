@@ -18,21 +18,13 @@ _EPOCH_US = 10**15  # us; a larger `time_usec` is since 1970, a smaller one sinc
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _MessageTimes:
-    """The times in messages of one kind.
+    """The times in messages of one kind."""
 
-    Attributes:
-        time: (n,) s since boot, or since 1970.
-        utc: whether the times are since 1970.
-        bad: (n,) True where the time is absent or impossible.
-        host: (n,) time of arrival, s since 1970.
-        place: (n,) place in the log.
-    """
-
-    time: NDArray[np.float64]
-    utc: bool
-    bad: NDArray[np.bool_]
-    host: NDArray[np.float64]
-    place: NDArray[np.int64]
+    time: NDArray[np.float64]  # (n,) s since boot, or since 1970
+    utc: bool  # whether the times are since 1970
+    bad: NDArray[np.bool_]  # (n,) True where the time is absent or impossible
+    host: NDArray[np.float64]  # (n,) time of arrival, s since 1970
+    place: NDArray[np.int64]  # (n,) place in the log
 
 
 class Clocks:
@@ -179,17 +171,11 @@ _LATE_PLACES = 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Link:
-    """Losses of one component by its sequence numbers.
+    """Losses of one component by its sequence numbers."""
 
-    Attributes:
-        received: number of different messages in the log.
-        lost: least number of missing messages: sequence numbers have 8 bits.
-        before, after: (k,) times of arrival before and after each loss [us].
-    """
-
-    received: int
-    lost: int
-    before: NDArray[np.int64]
+    received: int  # number of different messages in the log
+    lost: int  # least number of missing messages: sequence numbers have 8 bits
+    before: NDArray[np.int64]  # before, after: (k,) times of arrival before and after each loss [us]
     after: NDArray[np.int64]
 
     def findings(self, time: Callable[[NDArray[np.int64]], NDArray[np.float64]]) -> Iterator[Finding]:

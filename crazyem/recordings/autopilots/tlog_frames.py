@@ -37,19 +37,13 @@ class Frames:
 
 @dataclass(slots=True)
 class Frameset:
-    """The frames of a log.
+    """The frames of a log."""
 
-    Attributes:
-        frames: by system, component and message.
-        skipped: (offset, count) of each run of bytes that is no sound frame.
-        unknown: number of frames of messages that pymavlink does not know; they cannot be checked or read.
-        total: number of sound and unknown frames.
-    """
-
-    frames: dict[Key, Frames] = field(default_factory=dict)
+    frames: dict[Key, Frames] = field(default_factory=dict)  # by system, component and message
+    # (offset, count) of each run of bytes that is no sound frame
     skipped: list[tuple[int, int]] = field(default_factory=list)
-    unknown: int = 0
-    total: int = 0
+    unknown: int = 0  # number of frames of messages that pymavlink does not know; they cannot be checked or read
+    total: int = 0  # number of sound and unknown frames
 
 
 def scan(data: bytes, at_most: int | None = None) -> Frameset:

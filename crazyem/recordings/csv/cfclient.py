@@ -38,22 +38,14 @@ _RECORDING_SUFFIXES = {"", ".mcap", ".ulg", ".tlog", ".db3", ".parquet"}  # suff
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Part:
-    """One file.
-
-    Attributes:
-        block: name of the log block; the file name if it does not follow the pattern of cfclient.
-        date: start of writing, local time of the host; None if not in the file name.
-        variables: names of the columns.
-        stamp: (n,) ms, unwrapped from the first.
-        values: (n, k).
-    """
+    """One file."""
 
     path: Path
-    block: str
-    date: datetime | None
-    variables: tuple[str, ...]
-    stamp: NDArray[np.int64]
-    values: NDArray[np.float64]
+    block: str  # name of the log block; the file name if it does not follow the pattern of cfclient
+    date: datetime | None  # start of writing, local time of the host; None if not in the file name
+    variables: tuple[str, ...]  # names of the columns
+    stamp: NDArray[np.int64]  # (n,) ms, unwrapped from the first
+    values: NDArray[np.float64]  # (n, k)
 
 
 def recognises(head: bytes) -> bool:

@@ -54,17 +54,11 @@ _SHARE_OUTSIDE = 0.02  # of the interval between two rows; a corner may lie so f
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corners:
-    """The samples of a slow stream that was linearly interpolated at faster rows.
+    """The samples of a slow stream that was linearly interpolated at faster rows."""
 
-    Attributes:
-        row: (m,) the last row at or before each sample, increasing.
-        time: (m,) s.
-        value: (m,)
-    """
-
-    row: NDArray[np.int64]
-    time: NDArray[np.float64]
-    value: NDArray[np.float64]
+    row: NDArray[np.int64]  # (m,) the last row at or before each sample, increasing
+    time: NDArray[np.float64]  # (m,) s
+    value: NDArray[np.float64]  # (m,)
 
 
 def corners(

@@ -33,43 +33,27 @@ _ENTRY_KEYS = _CLAIMABLE | {
 
 @dataclass(frozen=True, slots=True)
 class SignalColumns:
-    """Columns of one signal.
+    """Columns of one signal."""
 
-    Attributes:
-        quantity: key of `SIGNALS`; the name of the signal up to its "@".
-        columns: in the order of the components of the signal. Three for an attitude as roll, pitch, yaw.
-        scale: factor to SI with sign, one per column.
-        offset: SI, added after the factor, one per column; () for none.
-        packet: name of the onboard packet of the columns, if the publisher interpolated lost packets; else None.
-        stream: signals with the same stream were sampled together.
-        clock: name of the clock of the stamps; None: the clock of the rows.
-        frame: frame of a vector in the file, if not that of the signal: "body" or "world"; else "".
-        axes: of the frames in the file, such as ("FRD", "NED"); signals have FLU and ENU.
-        inverted: the rotation in the file is from world to body.
-        attitude: the attitude signal that rotates a vector from the other frame.
-        missing: values that mean "not measured".
-        empty_is_missing: empty fields also mean "not measured", according to the publisher.
-        above: the signal is 1 if any column exceeds this threshold, else 0 (for `flying`); None for plain columns.
-        hold: s for which the signal stays 1 afterwards.
-        corners: a slower stream was linearly interpolated at the rows; its samples are the corners.
-    """
-
-    quantity: str
-    columns: tuple[str, ...]
-    scale: tuple[float, ...]
-    offset: tuple[float, ...] = ()
+    quantity: str  # key of `SIGNALS`; the name of the signal up to its "@"
+    columns: tuple[str, ...]  # in the order of the components of the signal. Three for an attitude as roll, pitch, yaw.
+    scale: tuple[float, ...]  # factor to SI with sign, one per column
+    offset: tuple[float, ...] = ()  # SI, added after the factor, one per column; () for none
+    # name of the onboard packet of the columns, if the publisher interpolated lost packets; else None
     packet: str | None = None
-    stream: str = ""
-    clock: str | None = None
-    frame: str = ""
+    stream: str = ""  # signals with the same stream were sampled together
+    clock: str | None = None  # name of the clock of the stamps; None: the clock of the rows
+    frame: str = ""  # frame of a vector in the file, if not that of the signal: "body" or "world"; else ""
+    # of the frames in the file, such as ("FRD", "NED"); signals have FLU and ENU
     axes: tuple[str, str] = ("FLU", "ENU")
-    inverted: bool = False
-    attitude: str = "attitude"
-    missing: tuple[float, ...] = ()
-    empty_is_missing: bool = False
+    inverted: bool = False  # the rotation in the file is from world to body
+    attitude: str = "attitude"  # the attitude signal that rotates a vector from the other frame
+    missing: tuple[float, ...] = ()  # values that mean "not measured"
+    empty_is_missing: bool = False  # empty fields also mean "not measured", according to the publisher
+    # the signal is 1 if any column exceeds this threshold, else 0 (for `flying`); None for plain columns
     above: float | None = None
-    hold: float = 0.0
-    corners: bool = False
+    hold: float = 0.0  # s for which the signal stays 1 afterwards
+    corners: bool = False  # a slower stream was linearly interpolated at the rows; its samples are the corners
 
     def converted(self, value: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, c) SI from numbers of the file; changes `value` in place."""
@@ -81,35 +65,22 @@ class SignalColumns:
 
 @dataclass(frozen=True, slots=True)
 class CsvMapping:
-    """A CSV format: its header and its contents (docs/reference/formats/csv.md).
+    """A CSV format: its header and its contents (docs/reference/formats/csv.md)."""
 
-    Attributes:
-        name, title: for people.
-        layout: "wide" (one row per instant) or "long" (one row per variable).
-        recognise: columns that identify the format.
-        time: name of the time column ("" with `rate`), and the divisor from its stamps to seconds.
-        rate: Hz, rate of rows without stamps, else NaN.
-        clock: name of the clock of the rows; "host" means seconds since the epoch.
-        signals: signal name -> its columns, with known errors corrected.
-        published: the same as the publisher states; differs from `signals` where the publisher is wrong.
-        columns: of the long form: role -> column name.
-        units: of columns that are no signal.
-        packets: packet -> its columns that are no signal.
-        claims: statements of the publisher about the whole recording, e.g. mass_kg.
-    """
-
-    name: str
+    name: str  # name, title: for people
     title: str
-    layout: str
-    recognise: tuple[str, ...]
-    time: tuple[str, float]
-    signals: Mapping[str, SignalColumns]
-    columns: Mapping[str, str]
+    layout: str  # "wide" (one row per instant) or "long" (one row per variable)
+    recognise: tuple[str, ...]  # columns that identify the format
+    time: tuple[str, float]  # name of the time column ("" with `rate`), and the divisor from its stamps to seconds
+    signals: Mapping[str, SignalColumns]  # signal name -> its columns, with known errors corrected
+    columns: Mapping[str, str]  # of the long form: role -> column name
+    # the same as the publisher states; differs from `signals` where the publisher is wrong
     published: Mapping[str, SignalColumns] = field(default_factory=dict)
-    rate: float = math.nan
-    clock: str = ""
-    units: Mapping[str, str] = field(default_factory=dict)
-    packets: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    rate: float = math.nan  # Hz, rate of rows without stamps, else NaN
+    clock: str = ""  # name of the clock of the rows; "host" means seconds since the epoch
+    units: Mapping[str, str] = field(default_factory=dict)  # of columns that are no signal
+    packets: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # packet -> its columns that are no signal
+    # statements of the publisher about the whole recording, e.g. mass_kg.
     claims: Mapping[str, str] = field(default_factory=dict)
 
 

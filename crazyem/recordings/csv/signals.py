@@ -25,42 +25,27 @@ _FLU_TO_FRD = (1.0, 0.0, 0.0, 0.0)  # half a turn about x
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How the columns of a file become signals.
+    """How the columns of a file become signals."""
 
-    Attributes:
-        signals: name -> columns; the vocabulary first, in its order.
-        raw: columns without a mapping: column -> (name of the signal, unit, packet or None).
-        packets: packet -> all its columns.
-        clock: name of the clock of the rows; "host" means that stamps are host times.
-    """
-
-    signals: Mapping[str, SignalColumns]
+    signals: Mapping[str, SignalColumns]  # name -> columns; the vocabulary first, in its order
+    # columns without a mapping: column -> (name of the signal, unit, packet or None)
     raw: Mapping[str, tuple[str, str, str | None]]
-    packets: Mapping[str, tuple[str, ...]]
-    clock: str
+    packets: Mapping[str, tuple[str, ...]]  # packet -> all its columns
+    clock: str  # name of the clock of the rows; "host" means that stamps are host times
 
 
 @dataclass(slots=True)
 class Rows:
-    """Some rows of a file, with neighbours before and after that are needed to find interpolated rows.
+    """Some rows of a file, with neighbours before and after that are needed to find interpolated rows."""
 
-    Attributes:
-        stamp: (n,) s on the clock of the rows.
-        origin: s; signals have the time `stamp - origin`.
-        columns: name -> (n,)
-        keep: rows first..last-1 of these become signals, the others are neighbours.
-        number: of row `keep[0]` in the file, from 0.
-        starts, ends: whether these rows hold the first and the last row of the file.
-        flown: signal -> stamp of the last earlier row in which its columns exceeded its threshold.
-    """
-
-    stamp: Array
-    origin: float
-    columns: dict[str, Array]
-    keep: tuple[int, int]
-    number: int = 0
-    starts: bool = True
+    stamp: Array  # (n,) s on the clock of the rows
+    origin: float  # s; signals have the time `stamp - origin`
+    columns: dict[str, Array]  # name -> (n,)
+    keep: tuple[int, int]  # rows first..last-1 of these become signals, the others are neighbours
+    number: int = 0  # of row `keep[0]` in the file, from 0
+    starts: bool = True  # starts, ends: whether these rows hold the first and the last row of the file
     ends: bool = True
+    # signal -> stamp of the last earlier row in which its columns exceeded its threshold
     flown: dict[str, float] = field(default_factory=dict)
 
 

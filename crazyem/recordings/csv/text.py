@@ -82,24 +82,15 @@ class Damage:
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """The names in the first line, and the format of the other lines.
+    """The names in the first line, and the format of the other lines."""
 
-    Attributes:
-        names: of the columns, made unique.
-        repeated: names that occurred more than once.
-        delimiter, decimal: characters.
-        words: columns of words (neither numbers nor true/false), by the first lines.
-        flags: columns of true and false.
-        hollow: columns without a name and without a value in the first lines.
-    """
-
-    names: tuple[str, ...]
-    repeated: tuple[str, ...]
-    delimiter: str
+    names: tuple[str, ...]  # of the columns, made unique
+    repeated: tuple[str, ...]  # names that occurred more than once
+    delimiter: str  # delimiter, decimal: characters
     decimal: str
-    words: frozenset[int]
-    flags: frozenset[int]
-    hollow: frozenset[int]
+    words: frozenset[int]  # columns of words (neither numbers nor true/false), by the first lines
+    flags: frozenset[int]  # columns of true and false
+    hollow: frozenset[int]  # columns without a name and without a value in the first lines
 
 
 def parse_header_line(line: str) -> tuple[list[str], str]:

@@ -43,22 +43,16 @@ ANNOUNCE_EVERY = 20  # chunks
 
 @dataclass
 class Book:
-    """Contents of the summary of a file: collected while writing, or rebuilt from a file.
+    """Contents of the summary of a file: collected while writing, or rebuilt from a file."""
 
-    Attributes:
-        schemas, channels: by identifier.
-        chunks, attachments, metadata: index entries with places in the file.
-        counts: messages of each channel.
-        start, end: log times of the first and last message [ns], None without messages.
-    """
-
-    schemas: dict[int, Schema] = field(default_factory=dict)
+    schemas: dict[int, Schema] = field(default_factory=dict)  # schemas, channels: by identifier
     channels: dict[int, Channel] = field(default_factory=dict)
+    # chunks, attachments, metadata: index entries with places in the file
     chunks: list[ChunkIndex] = field(default_factory=list)
     attachments: list[AttachmentIndex] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
-    counts: dict[int, int] = field(default_factory=dict)
-    start: int | None = None
+    counts: dict[int, int] = field(default_factory=dict)  # messages of each channel
+    start: int | None = None  # start, end: log times of the first and last message [ns], None without messages
     end: int | None = None
 
     def announce(self, record: Schema | Channel) -> None:

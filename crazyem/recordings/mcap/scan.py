@@ -88,18 +88,13 @@ class PackedChunk:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """The records of an unpacked chunk.
+    """The records of an unpacked chunk."""
 
-    Attributes:
-        data: (b,) bytes of the chunk.
-        messages: (n, 6) in order: offset of the payload in `data`, its length, channel, log time, publish time [ns,
-            both unsigned, stored in signed numbers], sequence.
-        others: (m, 3) opcode, offset of the content, length.
-    """
-
-    data: NDArray[np.uint8]
+    data: NDArray[np.uint8]  # (b,) bytes of the chunk
+    # (n, 6) in order: offset of the payload in `data`, its length, channel, log time, publish time [ns, both unsigned,
+    # stored in signed numbers], sequence
     messages: NDArray[np.int64]
-    others: NDArray[np.int64]
+    others: NDArray[np.int64]  # (m, 3) opcode, offset of the content, length
 
 
 def records(stream: BinaryIO, problems: list[Problem]) -> Iterator[Record]:
@@ -257,19 +252,12 @@ _BATCH_BYTES = 256 * 1024  # bytes of records outside chunks that form one part
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A chunk, or records outside chunks.
+    """A chunk, or records outside chunks."""
 
-    Attributes:
-        record: the first record.
-        scan: messages of a chunk or of a run of records outside chunks; None for anything else.
-        chunk: the packed chunk of the file, None outside chunks.
-        announced: its schemas and channels (records of the mcap library).
-    """
-
-    record: Record
-    scan: Scan | None = None
-    chunk: PackedChunk | None = None
-    announced: list[Any] = field(default_factory=list)
+    record: Record  # the first record
+    scan: Scan | None = None  # messages of a chunk or of a run of records outside chunks; None for anything else
+    chunk: PackedChunk | None = None  # the packed chunk of the file, None outside chunks
+    announced: list[Any] = field(default_factory=list)  # its schemas and channels (records of the mcap library)
 
 
 def parts(path: Path, problems: list[Problem], *, most: int | None = None) -> Iterator[Part]:

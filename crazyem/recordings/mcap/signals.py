@@ -80,17 +80,12 @@ def _write(recording: Recording, output: Output) -> None:
 
 @dataclass
 class _Group:
-    """Signals of one stream whose samples were taken and processed together, row by row.
-
-    Attributes:
-        base: (n,) places of the samples of the first signal in the processing order.
-        indices: places of the signals in the recording.
-    """
+    """Signals of one stream whose samples were taken and processed together, row by row."""
 
     stream: str
-    base: NDArray[np.int64]
+    base: NDArray[np.int64]  # (n,) places of the samples of the first signal in the processing order
     names: list[str] = field(default_factory=list)
-    indices: list[int] = field(default_factory=list)
+    indices: list[int] = field(default_factory=list)  # places of the signals in the recording
     arrays: list[SignalArray] = field(default_factory=list)
 
     def takes(self, array: SignalArray, rank: NDArray[np.int64]) -> bool:

@@ -41,21 +41,13 @@ LONGEST_NAME = 256  # bytes
 
 @dataclass(frozen=True, slots=True)
 class EventType:
-    """A kind of record.
+    """A kind of record."""
 
-    Attributes:
-        identifier: first two bytes of its records; 0xFFFF is "fixedFrequency".
-        name: unique in the file.
-        variables: unique in the event; names without a "." are the payload of the event.
-        letters: type letter of each variable.
-        layout: of a whole record; fields "id", "stamp", "0", "1", ...
-    """
-
-    identifier: int
-    name: str
-    variables: tuple[str, ...]
-    letters: tuple[str, ...]
-    layout: np.dtype[np.void]
+    identifier: int  # first two bytes of its records; 0xFFFF is "fixedFrequency"
+    name: str  # unique in the file
+    variables: tuple[str, ...]  # unique in the event; names without a "." are the payload of the event
+    letters: tuple[str, ...]  # type letter of each variable
+    layout: np.dtype[np.void]  # of a whole record; fields "id", "stamp", "0", "1", ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,21 +149,13 @@ BLANK_BYTES = (b"\xff", b"\x00")  # erased flash; reserved clusters that were ne
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Records:
-    """Whole records in file order.
+    """Whole records in file order."""
 
-    Attributes:
-        start: (n,) first byte of each record.
-        kind: (n,) index of the event type of each record.
-        order: rows of each kind among these records.
-        stop: byte after the last whole record.
-        unknown: the event id found at `stop`, None if the data end there.
-    """
-
-    start: NDArray[np.int64]
-    kind: NDArray[np.uint16]
-    order: list[NDArray[np.intp]]
-    stop: int
-    unknown: int | None
+    start: NDArray[np.int64]  # (n,) first byte of each record
+    kind: NDArray[np.uint16]  # (n,) index of the event type of each record
+    order: list[NDArray[np.intp]]  # rows of each kind among these records
+    stop: int  # byte after the last whole record
+    unknown: int | None  # the event id found at `stop`, None if the data end there
 
 
 def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int, blank: int) -> Records:

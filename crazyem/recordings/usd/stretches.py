@@ -138,21 +138,13 @@ class _Sample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stretch:
-    """Consecutive records.
+    """Consecutive records."""
 
-    Attributes:
-        first: number of the first record in the file.
-        time: (n,) s.
-        order: rows of each kind among these records.
-        packed: records of each kind.
-        ends: True if no others follow.
-    """
-
-    first: int
-    time: NDArray[np.float64]
-    order: Sequence[NDArray[np.intp]]
-    packed: Packed
-    ends: bool
+    first: int  # number of the first record in the file
+    time: NDArray[np.float64]  # (n,) s
+    order: Sequence[NDArray[np.intp]]  # rows of each kind among these records
+    packed: Packed  # records of each kind
+    ends: bool  # True if no others follow
 
 
 def stretches(survey: Survey, seconds: float, largest: float = STRETCH_BYTES) -> Iterator[Stretch]:
