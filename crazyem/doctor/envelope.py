@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from crazyem.doctor.kinematics import upright
 from crazyem.recordings.airborne import Airtime
 from crazyem.recordings.ordering import Array, sound_samples
 from crazyem.recordings.recording import Recording
@@ -61,15 +62,9 @@ def _tilt(source: str, upright: Array) -> dict[str, Any]:
     return {"tilt_from": source, "tilt_max_deg": float(np.degrees(np.arccos(np.clip(upright.min(), -1.0, 1.0))))}
 
 
-def _upright(q: Array) -> Array:
-    """Cosine of the tilt, from (n, 4) x y z w of any length but zero."""
-    square = np.sum(q**2, axis=1)
-    return 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2) / np.where(square > 0.0, square, 1.0)
-
-
 # Signal -> extremes of its samples in the air (n, c); Euler angles count where there is no quaternion.
 _EXTREMES: dict[str, Callable[[Array], dict[str, Any]]] = {
-    "attitude": lambda q: _tilt("attitude", _upright(q)),
+    "attitude": lambda q: _tilt("attitude", upright(q)),
     "euler": lambda angles: _tilt("euler", np.cos(angles[:, 0]) * np.cos(angles[:, 1])),
     "body_rate": lambda rate: {"body_rate_max_rad_s": tuple(float(r) for r in np.abs(rate).max(axis=0))},
     "position": lambda position: _range("altitude_{}_m", position[:, 2]),

@@ -212,6 +212,8 @@ def _comparison(
     single = tuple(slope(x[:, i], y[:, i], block) for i in range(3))
     factor = 1.0 if whole is None or whole.far_low <= 1.0 <= whole.far_high else whole.value
     rest = y - factor * x
+    square = float((at * at).sum())
+    ratio = float((at * y).sum()) / square if square > 0 else 1.0
     return Comparison(
         against=against,
         choice=choice,
@@ -223,7 +225,7 @@ def _comparison(
         covered=covered,
         mean=y.mean(axis=0),
         predicted=at.mean(axis=0),
-        mean_error=_error(y - at * _ratio(y, at), block),
+        mean_error=_error(y - at * ratio, block),
     )
 
 
@@ -312,11 +314,6 @@ def wrong_scale(
     if witnesses < 2:
         return [Finding(check, Grade.DEGRADES, text, name, (), numbers, alone)]
     return [Finding(check, Grade.DEGRADES, text, name, (), numbers, agreed, Fix("scale", (name,), fault.repair))]
-
-
-def _ratio(y: Array, x: Array) -> float:
-    square = float((x * x).sum())
-    return float((x * y).sum()) / square if square > 0 else 1.0
 
 
 def _error(value: Array, block: NDArray[np.int64]) -> Array:

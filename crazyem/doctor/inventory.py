@@ -91,7 +91,9 @@ class Inventory:
     def text(self, *, everything: bool = False) -> str:
         """A summary of at most 20 lines; with `everything`, then also metadata, clocks and all signals."""
         head = f"{self.path}: {self.source}, {self.duration_s:.2f} s, {self.samples} samples"
-        parts = [head, *self._vehicle_lines(), *_flight_lines(self.envelope, self.on_the_ground)]
+        kind = self.other_kind or (f"{self.kind}, by its autopilot" if self.kind else "")
+        remarks = [f"{what}: {text}" for what, text in (("vehicle", kind), ("weight", self.unlike)) if text]
+        parts = [head, *remarks, *_flight_lines(self.envelope, self.on_the_ground)]
         parts += [f"what it could identify, as vehicle {self.vehicle}:", *_verdict_lines(self.verdicts)]
         if self.no_replay and all(verdict.reason != self.no_replay for verdict in self.verdicts):
             parts.append(f"  crazyem replay cannot use it: {self.no_replay}")
@@ -101,12 +103,6 @@ class Inventory:
         if self.events:
             parts.append("events: " + ", ".join(f"{count} {kind}" for kind, count in self.events.items()))
         return "\n".join(parts)
-
-    def _vehicle_lines(self) -> list[str]:
-        """Kind of vehicle, and reasons why the vehicle's models may not fit."""
-        kind = self.other_kind or (f"{self.kind}, by its autopilot" if self.kind else "")
-        lines = {f"vehicle: {kind}": kind, f"weight: {self.unlike}": self.unlike}
-        return [line for line, known in lines.items() if known]
 
 
 def inventory(recording: Recording, vehicle: Vehicle | None = None) -> Inventory:

@@ -224,6 +224,12 @@ def turn(first: Array, second: Array) -> Array:
     return rotation_vector_from_quaternion(quaternion_product(quaternion_conjugate(first), second))
 
 
+def upright(q: Array) -> Array:
+    """(n,) cosine of the tilt, from quaternions (n, 4) x y z w of any length but zero."""
+    square = np.sum(q**2, axis=1)
+    return np.asarray(1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2) / np.where(square > 0.0, square, 1.0), float)
+
+
 def continuous(q: Array) -> Array:
     """Quaternions with signs chosen so that neighbours are near: q and -q are one attitude."""
     flips = np.where(np.einsum("ij,ij->i", q[1:], q[:-1]) < 0.0, -1.0, 1.0)

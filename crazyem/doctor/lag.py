@@ -165,18 +165,16 @@ def _changes(found: Array, start: float, end: float) -> _Changes:
     """Changes of the lag, from windows (n, 3) of time, lag, standard error."""
     t, y, e = found.T
     middle = _weighted_median(y, 1.0 / e)
-    ramp = _ramp(t, y)
+    i, j = np.triu_indices(t.size, 1)
+    ramp = float(np.median((y[j] - y[i]) / (t[j] - t[i])))  # median of the slopes of all pairs (Theil and Sen)
     line = _weighted_median(y - ramp * (t - t.mean()), 1.0 / e)
     rest = y - line - ramp * (t - t.mean())
+    error = max(_robust(rest), LEAST_SCATTER_RATIO * float(np.median(e)))
     return _Changes(
         start=line + ramp * (start - float(t.mean())),
         end=line + ramp * (end - float(t.mean())),
         drift=ramp * (end - start),
-        drift_error=1.25
-        * max(_robust(rest), LEAST_SCATTER_RATIO * float(np.median(e)))
-        / math.sqrt(t.size)
-        / float(t.std())
-        * (end - start),
+        drift_error=1.25 * error / math.sqrt(t.size) / float(t.std()) * (end - start),
         scatter=_robust((y - middle) / e),
         about_line=_robust(rest / e),
         low=float(np.quantile(y, 0.1)),
@@ -211,12 +209,6 @@ def _error(first: Track, second: Track, lag: float, explained: float, width: flo
 def _robust(rest: Array) -> float:
     """Standard deviation by the median of absolute values."""
     return 1.4826 * float(np.median(np.abs(rest)))
-
-
-def _ramp(t: Array, y: Array) -> float:
-    """Median of the slopes of all pairs (Theil and Sen), which is robust against outliers."""
-    i, j = np.triu_indices(t.size, 1)
-    return float(np.median((y[j] - y[i]) / (t[j] - t[i])))
 
 
 def _weighted_median(y: Array, w: Array) -> float:

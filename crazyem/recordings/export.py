@@ -54,7 +54,7 @@ def to_json(description: Description) -> dict[str, Any]:
         "origin_s": _plain(float(description.origin)),
         "signals": msgspec.to_builtins(description.entries),
         "metadata": _plain(description.metadata or {}),
-        "findings": [_plain(_finding(f)) for f in description.findings],
+        "findings": [_plain(f.to_dict(np.ndarray.tolist)) for f in description.findings],
         "events": [_plain({"time_s": float(e.time), "kind": e.kind, "data": e.data}) for e in description.events],
     }
 
@@ -100,13 +100,6 @@ def _back(value: Any) -> Any:
     if set(value) == {"bytes"} and isinstance(value["bytes"], str):
         return bytes.fromhex(value["bytes"])
     return {k: _back(v) for k, v in value.items()}
-
-
-def _finding(finding: Finding) -> dict[str, Any]:
-    table = finding.to_dict()
-    if finding.fix is not None and finding.fix.rows is not None:
-        table["fix"]["rows"] = finding.fix.rows.tolist()
-    return table
 
 
 def _rows(kind: type, value: Any) -> NDArray[np.int64]:

@@ -32,11 +32,10 @@ class Reader:
     def has(self, function: str) -> bool:
         return hasattr(self._module(), function)
 
-    def recognises(self, head: bytes) -> bool:
-        return self.has("recognises") and bool(self._module().recognises(head))
-
-    def recognises_folder(self, path: Path) -> bool:
-        return self.has("recognises_folder") and bool(self._module().recognises_folder(path))
+    def recognises(self, source: bytes | Path) -> bool:
+        """Whether the reader reads a file with these first bytes, or this folder."""
+        function = "recognises_folder" if isinstance(source, Path) else "recognises"
+        return self.has(function) and bool(getattr(self._module(), function)(source))
 
     def read(self, path: Path, options: ReadOptions) -> Recording:
         recording = self._module().read(path, options)
@@ -93,19 +92,17 @@ def reader_of(path: Path) -> Reader:
     """The reader for a file or folder. Raises as `open_recording`."""
     known = ", ".join(reader.name for reader in READERS)
     try:
-        if path.is_dir():
-            for reader in READERS:
-                if reader.recognises_folder(path):
-                    return reader
-            raise UsageError(f"{path} is a directory, not a recording.")
-        if not path.exists():
+        folder = path.is_dir()
+        if not folder and not path.exists():
             raise UsageError(f"{path}: no such file.")
+        head = b"" if folder else head_of(path)
+        reader = next((reader for reader in READERS if reader.recognises(path if folder else head)), None)
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
-    head = head_of(path)
-    for reader in READERS:
-        if reader.recognises(head):
-            return reader
+    if reader is not None:
+        return reader
+    if folder:
+        raise UsageError(f"{path} is a directory, not a recording.")
     refusal = next((why for start, why in _REFUSALS if head.startswith(start)), None)
     if refusal is not None:
         raise KnownFileError(f"{path} {refusal}")

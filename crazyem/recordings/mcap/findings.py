@@ -17,13 +17,7 @@ _MOST_ROWS = 100_000_000  # rows of a fix; guards against damaged runs
 
 def findings_to_json(findings: Iterable[Finding]) -> str:
     """The findings as one text; the sample numbers of fixes as runs."""
-    entries = []
-    for finding in findings:
-        entry = finding.to_dict()
-        if finding.fix is not None and finding.fix.rows is not None:
-            entry["fix"]["rows"] = _runs(np.asarray(finding.fix.rows, np.int64))
-        entries.append(entry)
-    return json.dumps(entries)
+    return json.dumps([finding.to_dict(rows=_runs) for finding in findings])
 
 
 def findings_from_json(text: str) -> tuple[Finding, ...]:

@@ -151,25 +151,15 @@ def _plausible(opcode: int, length: int) -> bool:
 def _consistent(opcode: int, data: bytes) -> bool:
     """Whether the lengths inside a record agree with the length of the record."""
     try:
-        if opcode == CHUNK:
-            parse_chunk(data)
-        elif _is_chunk(data):
-            return False  # a chunk with a damaged opcode
-        elif opcode == MESSAGE_INDEX:
-            return len(data) >= 6 and int.from_bytes(data[2:6], "little") == len(data) - 6
-        elif opcode == METADATA:
-            name = int.from_bytes(data[:4], "little")
-            return int.from_bytes(data[4 + name : 8 + name], "little") == len(data) - 8 - name
+        compression = parse_chunk(data).compression
     except ValueError:
-        return False
-    return True
-
-
-def _is_chunk(data: bytes) -> bool:
-    try:
-        return parse_chunk(data).compression in ("", "lz4", "zstd")
-    except ValueError:
-        return False
+        compression = None
+    if opcode == CHUNK or compression in ("", "lz4", "zstd"):  # any other record is a chunk with a damaged opcode
+        return opcode == CHUNK and compression is not None
+    if opcode == MESSAGE_INDEX:
+        return len(data) >= 6 and int.from_bytes(data[2:6], "little") == len(data) - 6
+    name = int.from_bytes(data[:4], "little")
+    return opcode != METADATA or int.from_bytes(data[4 + name : 8 + name], "little") == len(data) - 8 - name
 
 
 def _next_chunk(stream: BinaryIO, offset: int, size: int) -> int | None:
