@@ -146,12 +146,17 @@ def rows_of(recording: Recording, names: Iterable[str], *, samples: int = 1 << 1
         samples: largest number of samples of a signal in a block.
     """
     arrays = {name: recording.signals[name] for name in names if name in recording.signals}
-    places = {name: _by_order(array.order) for name, array in arrays.items()}
-    orders = {name: a.order if places[name] is None else a.order[places[name]] for name, a in arrays.items()}
+    # numbers of the samples in processing order; None if they are in this order already
+    places = {
+        name: None if (a.order[1:] >= a.order[:-1]).all() else np.argsort(a.order, kind="stable")
+        for name, a in arrays.items()
+    }
+    orders = {name: a.order if (p := places[name]) is None else a.order[p] for name, a in arrays.items()}
     at, most = dict.fromkeys(arrays, 0), samples
     while any(at[name] < order.size for name, order in orders.items()):
         ends = _ends(orders, at, most)
-        taken = {name: _slice(places[name], at[name], ends[name]) for name in arrays}
+        spans = {name: np.arange(at[name], ends[name]) for name in arrays}
+        taken = {name: span if (p := places[name]) is None else p[span] for name, span in spans.items()}
         rows = _rows(arrays, taken)
         if any(ends[name] < order.size for name, order in orders.items()):
             if rows.time.size < 2:  # the first row may continue in the next block
@@ -161,15 +166,6 @@ def rows_of(recording: Recording, names: Iterable[str], *, samples: int = 1 << 1
             ends = {name: at[name] + rows.row[name].size for name in arrays}
         yield rows
         at, most = ends, samples
-
-
-def _by_order(order: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """(n,) numbers of the samples in processing order; None if they are in this order already."""
-    return None if (order[1:] >= order[:-1]).all() else np.argsort(order, kind="stable")
-
-
-def _slice(place: NDArray[np.int64] | None, begin: int, end: int) -> NDArray[np.int64]:
-    return np.arange(begin, end) if place is None else place[begin:end]
 
 
 def _ends(orders: dict[str, NDArray[np.int64]], at: dict[str, int], most: int) -> dict[str, int]:

@@ -170,11 +170,11 @@ def believed(
     return keep, shifts, faults
 
 
-def finding(faults: Sequence[Fault], signals: Iterable[str] = ()) -> list[Finding]:
+def finding(faults: Sequence[Fault], signals: Iterable[str] | Mapping[str, SignalArray] = ()) -> list[Finding]:
     """One finding for all faults of a recording; none without faults.
 
     Args:
-        signals: names of the affected signals that the recording still has.
+        signals: names of the affected signals that the recording still has, or all its signals.
     """
     if not faults:
         return []
@@ -184,6 +184,9 @@ def finding(faults: Sequence[Fault], signals: Iterable[str] = ()) -> list[Findin
     if len(faults) > len(said):
         said.append(f"and so on in {len(faults) - len(said)} more streams")
     grave = bool(moved) or any(fault.count > 1 and 2 * fault.count >= fault.total for fault in faults)
+    if isinstance(signals, Mapping):
+        streams = {fault.stream for fault in faults}
+        signals = [name for name, array in signals.items() if array.stream in streams]
     names = tuple(dict.fromkeys(signals))
     advice = "Look for what wrote these stamps: much of the recording has no time." if grave else ""
     if moved:
@@ -195,12 +198,6 @@ def finding(faults: Sequence[Fault], signals: Iterable[str] = ()) -> list[Findin
     fix = Fix(STAMP_CHECK, names) if names else None
     found = Finding(STAMP_CHECK, Grade.DEGRADES if grave else Grade.HARMLESS, text, "", (), evidence, advice, fix)
     return [found]
-
-
-def finding_in(faults: Sequence[Fault], signals: Mapping[str, SignalArray]) -> list[Finding]:
-    """As `finding`, with the names of the signals whose streams have faults."""
-    streams = {fault.stream for fault in faults}
-    return finding(faults, [name for name, array in signals.items() if array.stream in streams])
 
 
 def _words(fault: Fault) -> str:
@@ -285,7 +282,8 @@ def _kept(recording: Recording, before: Mapping[str, Column], after: Recording |
     later = {s: a.time[:_NEIGHBOURS] for s, a in _streams(after)} if after is not None else {}
     streams = list(_streams(recording))
     times = [np.concatenate([before.get(s, np.empty(0)), a.time, later.get(s, np.empty(0))]) for s, a in streams]
-    if all(_sound(time) for time in times) and _close(times):
+    ends = np.concatenate([time[[0, -1]] for time in times if time.size] or [np.zeros(1)])
+    if all(_sound(time) for time in times) and ends.max() - ends.min() <= LONGEST_RECORDING:
         return {}
     pooled = np.concatenate(times)
     pooled = pooled[np.isfinite(pooled)]
@@ -309,9 +307,3 @@ def _without(recording: Recording, kept: Mapping[int, NDArray[np.int64]], *, who
         if rows is None or rows.size or not whole:
             signals[name] = array if rows is None else array.rows(rows)
     return replace(recording, signals=signals)
-
-
-def _close(times: Sequence[Column]) -> bool:
-    """Whether all streams together (each in order) are no longer than a recording can be."""
-    ends = np.concatenate([time[[0, -1]] for time in times if time.size] or [np.zeros(1)])
-    return bool(ends.max() - ends.min() <= LONGEST_RECORDING)

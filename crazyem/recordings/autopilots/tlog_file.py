@@ -34,7 +34,7 @@ from crazyem.recordings.autopilots.tlog_frames import MESSAGES, Frameset, column
 from crazyem.recordings.contents import ReadOptions, contents
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import Event, Recording
-from crazyem.recordings.stamps import finding_in
+from crazyem.recordings.stamps import finding
 from crazyem.recordings.topics import Source, Topic, damage, named, seconds, signals_of, text_of, unconnected
 from crazyem.signals.mavlink import RPM_IN_RAD_PER_S, mapping
 
@@ -171,7 +171,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
     absent, unplugged = unconnected(topics, sources, signals)
     losses = link(found, system, clocks.component, clocks.starts)
     findings = [*damage(found.skipped, size, "MAVLink frame"), *losses.findings(clocks.arrival), *others]
-    findings += [*finding_in(clocks.faults, signals), *clocks.findings(), *left_out, *unplugged]
+    findings += [*finding(clocks.faults, signals), *clocks.findings(), *left_out, *unplugged]
     findings += _notes(signals, found, autopilot == _ARDUPILOT)
     metadata = {
         "tlog": _about(found, system, clocks),

@@ -34,7 +34,7 @@ from crazyem.recordings.autopilots.ulog_scan import HEADER_BYTES, ULOG_MAGIC, Sc
 from crazyem.recordings.contents import ReadOptions, contents
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import Recording
-from crazyem.recordings.stamps import Fault, believed, finding_in
+from crazyem.recordings.stamps import Fault, believed, finding
 from crazyem.recordings.topics import Source, Topic, damage, named, ranks, seconds, signals_of, text_of, unconnected
 from crazyem.signals.mavlink import RPM_IN_RAD_PER_S
 
@@ -73,7 +73,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
     mapped = [m for source in _ULOG_SIGNALS for m in source.of(topics)]
     signals, left_out = signals_of(topics, mapped)
     absent, unplugged = unconnected(topics, _ULOG_SIGNALS, signals)
-    findings = [*_integrity(sound, topics, log), *finding_in(faults, signals), *left_out]
+    findings = [*_integrity(sound, topics, log), *finding(faults, signals), *left_out]
     findings += [*unplugged, *_notes(signals)]
     metadata = _metadata(log) | {"vehicle": vehicle_of(_kind(log)), "not_measured": absent}
     return Recording(str(path), "ulog", signals, {k: v for k, v in metadata.items() if v}, tuple(findings))

@@ -23,7 +23,7 @@ from crazyem.recordings.contents import ReadOptions, contents, head_of
 from crazyem.recordings.csv.file import read as read_csv
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import Recording
-from crazyem.recordings.stamps import Fault, finding_in
+from crazyem.recordings.stamps import Fault, finding
 from crazyem.recordings.tables import Table, signals_from_tables
 from crazyem.recordings.topics import ranks
 
@@ -104,7 +104,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
     metadata = {"cfclient": _metadata(path, full)}
     meaning = motor_meaning.decide(tables, given=options.motor, metadata=metadata)
     signals = signals_from_tables(tables, motor=meaning.meaning)
-    findings += finding_in(faults, signals)
+    findings += finding(faults, signals)
     return Recording(str(path), "csv:cfclient", signals, metadata | meaning.metadata, (*findings, *meaning.findings))
 
 

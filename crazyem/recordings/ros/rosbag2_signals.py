@@ -16,7 +16,7 @@ from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.ros.ros2_messages import MessageType, Rows, rows_of
-from crazyem.recordings.stamps import Fault, finding_in
+from crazyem.recordings.stamps import Fault, finding
 from crazyem.recordings.tables import Table, signals_from_tables
 from crazyem.recordings.topics import Mapped, Source, Topic, ranks, seconds, signals_of, text_of
 
@@ -144,7 +144,7 @@ def recording_of(
         (
             *findings,
             *_damage(decoded),
-            *finding_in([d.fault() for d in decoded if d.moved and d.clock == HOST_CLOCK], signals),
+            *finding([d.fault() for d in decoded if d.moved and d.clock == HOST_CLOCK], signals),
             *clock_notes,
             *log_notes,
             *meaning.findings,

@@ -167,7 +167,7 @@ def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int, bla
     start, kind = array("q"), array("H")
     at = begin
     while at < blank:
-        k, size = known.get(data[at : at + 2], (0, end))
+        k, size = known.get(data[at : at + 2], (0, end + 1))
         if at + size > end:
             break
         start.append(at)
