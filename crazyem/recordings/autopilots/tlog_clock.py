@@ -26,6 +26,11 @@ class _MessageTimes:
     host: NDArray[np.float64]  # (n,) time of arrival, s since 1970
     place: NDArray[np.int64]  # (n,) place in the log
 
+    @property
+    def lead(self) -> NDArray[np.float64]:
+        """Arrival minus the own time [s], where this is known."""
+        return (self.host - self.time)[~self.bad]
+
 
 class Clocks:
     """The clocks of a log on one axis: time since boot of the autopilot, or host time if no message has it.
@@ -45,7 +50,7 @@ class Clocks:
             own = _message_times(MESSAGES[identifier], frames)
             if own is not None:
                 (epochs if own.utc else boots).setdefault(component, []).append(own)
-        self._utc = {c: float(np.median(_joined([o.host - o.time for o in v], v))) for c, v in epochs.items()}
+        self._utc = {c: float(np.median(np.concatenate([o.lead for o in v]))) for c, v in epochs.items()}
         # component -> place of the first message of each restart; host time of each start
         self._starts = {c: _starts(v) for c, v in boots.items()}
         self._boots = {c: _offsets(v, self._starts[c]) for c, v in boots.items()}
@@ -115,10 +120,6 @@ class Clocks:
         return [Finding(STAMP_CHECK, Grade.DEGRADES, text, intervals=parts, evidence=evidence, advice=advice)]
 
 
-def _joined(columns: list[NDArray[np.float64]], own: list[_MessageTimes]) -> NDArray[np.float64]:
-    return np.concatenate([column[~o.bad] for column, o in zip(columns, own, strict=True)])
-
-
 def _starts(own: list[_MessageTimes]) -> NDArray[np.int64]:
     """Places (k,) of the first message after each restart of an autopilot.
 
@@ -136,7 +137,7 @@ def _starts(own: list[_MessageTimes]) -> NDArray[np.int64]:
 def _offsets(own: list[_MessageTimes], starts: NDArray[np.int64]) -> NDArray[np.float64]:
     """Host time [s] of each start."""
     part = np.searchsorted(starts, np.concatenate([o.place[~o.bad] for o in own]), side="right")
-    lead = _joined([o.host - o.time for o in own], own)
+    lead = np.concatenate([o.lead for o in own])
     return np.array([float(np.median(lead[part == k])) for k in range(starts.size + 1)])
 
 
@@ -203,11 +204,9 @@ def link(found: Frameset, system: int, component: int, starts: NDArray[np.int64]
         starts: places (k,) in the log at which the sequence numbers restart.
     """
     chosen = [f for (s, c, _), f in found.frames.items() if (s, c) == (system, component)]
-    place = np.concatenate([np.array(f.places, np.int64) for f in chosen])
-    order = np.argsort(place)
-    stamp = np.concatenate([np.array(f.stamps, np.int64) for f in chosen])[order]
-    sequence = np.concatenate([np.array(f.sequence, np.int64) for f in chosen])[order]
-    cuts = np.searchsorted(place[order], starts)
+    rows = np.concatenate([np.array([f.places, f.stamps, f.sequence], np.int64) for f in chosen], axis=1)
+    place, stamp, sequence = rows[:, np.argsort(rows[0])]
+    cuts = np.searchsorted(place, starts)
     received = lost = 0
     before, after = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for numbers, stamps in zip(np.split(sequence, cuts), np.split(stamp, cuts), strict=True):
@@ -216,8 +215,8 @@ def link(found: Frameset, system: int, component: int, starts: NDArray[np.int64]
         number = np.concatenate([[0], np.cumsum((np.diff(numbers) + _LATE_PLACES) % 256 - _LATE_PLACES)])
         sent, first = np.unique(number, return_index=True)
         missing = np.diff(sent) - 1
-        rows = np.flatnonzero(missing)
+        gaps = np.flatnonzero(missing)
         received, lost = received + sent.size, lost + int(missing.sum())
-        before.append(stamps[first[rows]])
-        after.append(stamps[first[rows + 1]])
+        before.append(stamps[first[gaps]])
+        after.append(stamps[first[gaps + 1]])
     return Link(received, lost, np.concatenate(before), np.concatenate(after))

@@ -6,7 +6,7 @@ docs/reference/formats/tlog.md explains the table.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ from crazyem.recordings.autopilots.frd_ned import (
     vehicle_of,
 )
 from crazyem.recordings.autopilots.tlog_clock import Clocks, link
-from crazyem.recordings.autopilots.tlog_frames import MESSAGES, Frameset, columns_of, scan, units_of
+from crazyem.recordings.autopilots.tlog_frames import MESSAGES, Frames, Frameset, columns_of, scan, units_of
 from crazyem.recordings.contents import ReadOptions, contents
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import Event, Recording
@@ -281,23 +281,26 @@ def _about(found: Frameset, system: int, clocks: Clocks) -> dict[str, str]:
     }
 
 
+def _messages(found: Frameset, system: int, name: str) -> Iterator[tuple[Frames, dict[str, NDArray[np.generic]]]]:
+    """The frames of one message of a system, and their columns, for each component."""
+    for (sender, _, identifier), frames in found.frames.items():
+        if sender == system and MESSAGES[identifier].msgname == name:
+            yield frames, columns_of(MESSAGES[identifier], frames.payloads)
+
+
 def _parameters(found: Frameset, system: int) -> dict[str, str]:
     """The last value of each parameter that the vehicle reported."""
     values: dict[str, str] = {}
-    for (sender, _, identifier), frames in found.frames.items():
-        if sender == system and MESSAGES[identifier].msgname == "PARAM_VALUE":
-            columns = columns_of(MESSAGES[identifier], frames.payloads)
-            for name, value in zip(columns["param_id"].tolist(), columns["param_value"].tolist(), strict=True):
-                values[text_of(name)] = repr(value)
+    for _, columns in _messages(found, system, "PARAM_VALUE"):
+        pairs = zip(columns["param_id"].tolist(), columns["param_value"].tolist(), strict=True)
+        values |= {text_of(name): repr(value) for name, value in pairs}
     return dict(list(values.items())[:5000])
 
 
 def _events(found: Frameset, system: int) -> tuple[Event, ...]:
     """Text messages of the vehicle."""
     events = []
-    for (sender, _, identifier), frames in found.frames.items():
-        if sender == system and MESSAGES[identifier].msgname == "STATUSTEXT":
-            columns = columns_of(MESSAGES[identifier], frames.payloads)
-            rows = zip(frames.stamps, columns["severity"].tolist(), columns["text"].tolist(), strict=True)
-            events += [Event(t / 1e6, "log", {"severity": s, "text": text_of(x)}) for t, s, x in rows]
+    for frames, columns in _messages(found, system, "STATUSTEXT"):
+        rows = zip(frames.stamps, columns["severity"].tolist(), columns["text"].tolist(), strict=True)
+        events += [Event(t / 1e6, "log", {"severity": s, "text": text_of(x)}) for t, s, x in rows]
     return tuple(sorted(events, key=lambda e: e.time)[:_MOST_EVENTS])

@@ -98,10 +98,16 @@ def read(path: Path, options: ReadOptions) -> Recording:
         if not part.stamp.size:
             findings.append(note("integrity", f"{part.path.name} has a header and not a single row."))
     if not folder:
-        _mention_siblings(path, findings)
+        with contextlib.suppress(OSError, UsageError):
+            others = len(_files(path.parent)) - 1
+            if 0 < others < _MOST_SIBLINGS and recognises_folder(path.parent):
+                text = f"{others} more files of the session lie beside it; read the folder to have them too."
+                findings.append(note("integrity", text, files=others))
     full = _aligned(full)
     tables = _tables(full)
-    metadata = {"cfclient": _metadata(path, full)}
+    section = {"session": path.name if folder else path.parent.name}
+    section |= {f"file.{part.path.name}": f"{part.block}: {' '.join(part.variables)}" for part in full}
+    metadata = {"cfclient": section}
     meaning = motor_meaning.decide(tables, given=options.motor, metadata=metadata)
     signals = signals_from_tables(tables, motor=meaning.meaning)
     findings += finding(faults, signals)
@@ -302,18 +308,3 @@ def _tables(parts: Sequence[_Part]) -> list[Table]:
         columns = {variable: values[:, i] for i, variable in enumerate(variables)}
         tables.append(Table(name, columns, stamp / 1000.0, order))
     return tables
-
-
-def _mention_siblings(path: Path, findings: list[Finding]) -> None:
-    with contextlib.suppress(OSError, UsageError):
-        others = len(_files(path.parent)) - 1
-        if 0 < others < _MOST_SIBLINGS and recognises_folder(path.parent):
-            text = f"{others} more files of the session lie beside it; read the folder to have them too."
-            findings.append(note("integrity", text, files=others))
-
-
-def _metadata(path: Path, parts: Sequence[_Part]) -> dict[str, str]:
-    section = {"session": path.name if path.is_dir() else path.parent.name}
-    for part in parts:
-        section[f"file.{part.path.name}"] = f"{part.block}: {' '.join(part.variables)}"
-    return section

@@ -137,17 +137,8 @@ class _Kept:
         if packet is not None and self.straight[packet].any():
             marked = self.straight[packet]
             value[marked] = np.nan
-        return SignalArray(
-            self.time,
-            value,
-            self._raw_order,
-            self.host,
-            marked,
-            unit=unit,
-            clock=self.layout.clock,
-            stream=packet or "rows",
-            source=(column,),
-        )
+        about = ("", unit, "", self.layout.clock, packet or "rows", (column,))
+        return SignalArray(self.time, value, self._raw_order, self.host, marked, *about)
 
     def slow(self, source: SignalColumns, place: int, step: int) -> SignalArray:
         """The original samples of a slow stream that was linearly interpolated at the rows."""

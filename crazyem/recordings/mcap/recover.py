@@ -123,7 +123,12 @@ def _copy(source: Path, head: bytes, output: Output) -> Report:
                 output.metadata(record.name, record.metadata)
                 report.metadata += 1
         elif part.record.opcode == mcap_scan.ATTACHMENT:
-            report.attachments += _attachment(source, part, output)
+            with source.open("rb") as stream:
+                stream.seek(part.record.offset + HEAD.size)
+                record = parse(mcap_scan.ATTACHMENT, stream.read(part.record.end - stream.tell()))
+            if record is not None:
+                output.attachment(record)
+                report.attachments += 1
     report.lost_messages = lost if report.profile == PROFILE else None
     output.finish()
     return report
@@ -173,14 +178,3 @@ def _messages(output: Output, part: Part, report: Report) -> None:
         data = scan.data[at : at + length].tobytes()
         output.message(channel, log_time % 2**64, data, sequence=sequence, publish_time=published % 2**64)
     output.flush()
-
-
-def _attachment(source: Path, part: Part, output: Output) -> int:
-    with source.open("rb") as stream:
-        stream.seek(part.record.offset + HEAD.size)
-        data = stream.read(part.record.end - part.record.offset - HEAD.size)
-    record = parse(mcap_scan.ATTACHMENT, data)
-    if record is None:
-        return 0
-    output.attachment(record)
-    return 1

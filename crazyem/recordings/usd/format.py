@@ -65,8 +65,11 @@ def parse_header(data: bytes, path: object) -> Header:
     Raises: FileFormatError naming `path` and the first invalid byte of the header.
     """
     cursor = _Cursor(data, path)
-    if cursor.u8("magic byte") != USD_MAGIC:
+    if not data:
+        raise cursor.cut("magic byte")
+    if data[0] != USD_MAGIC:
         raise FileFormatError(f"{path} does not start with 0xBC, as a uSD card log does.")
+    cursor.at = 1
     version = cursor.u16("version")
     if version not in USD_VERSIONS:
         raise FileFormatError(f"{path}: uSD card log of version {version}, known are 1 and 2.")
@@ -86,7 +89,8 @@ def parse_header(data: bytes, path: object) -> Header:
 
 def _event(cursor: "_Cursor", version: int, taken: set[str]) -> EventType:
     identifier = cursor.u16("event id")
-    name = _unique(cursor.name("event name"), taken, f"@{identifier}")
+    name = cursor.name("event name")
+    name += f"@{identifier}" if name in taken else ""
     count = cursor.u16(f"number of variables of {name}")
     if count > _MOST_VARIABLES:
         raise FileFormatError(f"{cursor.path}: the header declares {count} variables in {name} (byte {cursor.at - 2}).")
@@ -99,15 +103,11 @@ def _event(cursor: "_Cursor", version: int, taken: set[str]) -> EventType:
         if text[-3:-2] != "(" or text[-1:] != ")" or letter not in TYPE_LETTERS:
             raise FileFormatError(f'{cursor.path}: "{text[:40]}" (byte {start}) is not a variable with a known type.')
         # a variable may occur twice in an event, as two samples microseconds apart
-        variables.append(_unique(variable, set(variables), f"#{len(variables)}"))
+        variables.append(variable + (f"#{len(variables)}" if variable in variables else ""))
         letters.append(letter)
     fields = [("id", "<u2"), ("stamp", STAMP_TYPES[version][0])]
     fields += [(str(i), TYPE_LETTERS[letter][0]) for i, letter in enumerate(letters)]
     return EventType(identifier, name, tuple(variables), tuple(letters), np.dtype(fields))
-
-
-def _unique(name: str, taken: set[str], suffix: str) -> str:
-    return name + suffix if name in taken else name
 
 
 class _Cursor:
@@ -116,31 +116,24 @@ class _Cursor:
     def __init__(self, data: bytes, path: object) -> None:
         self.data, self.path, self.at = data, path, 0
 
-    def u8(self, what: str) -> int:
-        return self._take(1, what)[0]
-
     def u16(self, what: str) -> int:
-        return int.from_bytes(self._take(2, what), "little")
+        if self.at + 2 > len(self.data):
+            raise self.cut(what)
+        self.at += 2
+        return int.from_bytes(self.data[self.at - 2 : self.at], "little")
 
     def name(self, what: str) -> str:
         """The text up to the next NUL; the cursor moves behind the NUL."""
         end = self.data.find(0, self.at, self.at + LONGEST_NAME)
         if end < 0 and len(self.data) < self.at + LONGEST_NAME:
-            raise self._cut(what)
+            raise self.cut(what)
         text = self.data[self.at : end]
         if end < 0 or not text.isascii() or not text.decode("ascii").isprintable():
             raise FileFormatError(f"{self.path}: the {what} at byte {self.at} is not text.")
         self.at = end + 1
         return text.decode("ascii")
 
-    def _take(self, count: int, what: str) -> bytes:
-        taken = self.data[self.at : self.at + count]
-        if len(taken) < count:
-            raise self._cut(what)
-        self.at += count
-        return taken
-
-    def _cut(self, what: str) -> FileFormatError:
+    def cut(self, what: str) -> FileFormatError:
         return FileFormatError(f"{self.path} ends after {len(self.data)} bytes, in its header ({what}).")
 
 
