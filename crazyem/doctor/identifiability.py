@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor import excitation
-from crazyem.doctor.envelope import sound_signal
 from crazyem.doctor.excitation import Steps
 from crazyem.doctor.kinematics import continuous
 from crazyem.doctor.regression import Fit, linear_fit
@@ -19,7 +18,7 @@ from crazyem.physics.effects.timing import INPUT_DELAY
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.airborne import Airtime
 from crazyem.recordings.finding import percent
-from crazyem.recordings.ordering import Array, held
+from crazyem.recordings.ordering import Array, held, sound_signal
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.thrust import UNKNOWN_VOLTAGE_ERROR, Inputs, inputs_of
 from crazyem.vehicle import GRAVITY, Vehicle

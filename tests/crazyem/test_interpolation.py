@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crazyem.recordings.csv.interpolation import corners, interpolated_rows
+from crazyem.recordings.csv.signals import corners, interpolated_rows
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 8))

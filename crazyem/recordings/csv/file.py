@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
 from crazyem.recordings.contents import GrowingArray, ReadOptions
-from crazyem.recordings.csv.interpolation import CONTEXT_ROWS
 from crazyem.recordings.csv.long import read_long
 from crazyem.recordings.csv.mapping import CsvMapping, known_mappings, mapping_for
-from crazyem.recordings.csv.signals import Layout, Rows, signals_of
+from crazyem.recordings.csv.signals import CONTEXT_ROWS, Layout, Rows, signals_of
 from crazyem.recordings.csv.text import Columns, Damage, Header, parse_header_line, read_columns, read_header
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import Recording

@@ -8,9 +8,8 @@ from crazyem.errors import FileFormatError
 from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.mcap.content import Content, join
-from crazyem.recordings.mcap.findings import IMPORT_METADATA, finding_of, findings_from_json
 from crazyem.recordings.mcap.scan import MCAP_MAGIC, Loss, Part, Problem, from_summary, parts, profile_of
-from crazyem.recordings.mcap.schemas import PROFILE
+from crazyem.recordings.mcap.schemas import IMPORT_METADATA, PROFILE, findings_from_json
 from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.tables import Table, signals_from_tables
@@ -166,3 +165,22 @@ def _imported(own: Mapping[str, str] | None) -> tuple[float, str, tuple[Finding,
         text = "What the first reader of this recording noticed cannot be read any more."
         return 0.0, own.get("source", "mcap"), (note("integrity", text, Grade.DEGRADES),)
     return origin if math.isfinite(origin) else 0.0, own.get("source", "mcap"), findings
+
+
+def finding_of(problem: Problem, *, lost_messages: int | None = None) -> Finding:
+    """The finding about bytes that a reader could not use."""
+    where = f"byte {problem.offset}"
+    evidence = {"offset_byte": float(problem.offset), "lost_byte": float(problem.end - problem.offset)}
+    lost = ""
+    if lost_messages is not None:
+        evidence["lost_messages"] = float(lost_messages)
+        lost = f", {lost_messages} messages are lost"
+    if problem.loss is Loss.OPEN:
+        text = "The recording was not closed; every complete chunk was read, at most the last second is missing."
+        return Finding("integrity", Grade.HARMLESS, text, evidence=evidence)
+    if problem.loss is Loss.CUT:
+        text = f"The file ends in the middle of a record ({where}); everything before it was read."
+        return Finding("integrity", Grade.HARMLESS, text, evidence=evidence)
+    text = f"The file is damaged at {where}: {problem.why}; {problem.end - problem.offset} bytes were left out{lost}."
+    advice = "Look for another copy of the file; what is between the last sample before and the first after is gone."
+    return Finding("integrity", Grade.DEGRADES, text, evidence=evidence, advice=advice)

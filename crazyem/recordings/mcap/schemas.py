@@ -12,8 +12,12 @@ from collections.abc import Iterable, Mapping
 from importlib import metadata as package_metadata
 from typing import Any
 
+import msgspec
+import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from numpy.typing import NDArray
 
+from crazyem.recordings.finding import Finding
 from crazyem.signals.sample import Block, Packet, Variable
 
 _F = descriptor_pb2.FieldDescriptorProto
@@ -257,3 +261,34 @@ def _version(package: str) -> str:
         return package_metadata.version(package)
     except package_metadata.PackageNotFoundError:
         return "unknown"
+
+
+IMPORT_METADATA = "crazyem.signals"  # metadata record that crazyem adds to an imported recording
+_MOST_ROWS = 100_000_000  # rows of a fix; guards against damaged runs
+
+
+def findings_to_json(findings: Iterable[Finding]) -> str:
+    """The findings as one text; the sample numbers of fixes as runs."""
+    return json.dumps([finding.to_dict(rows=_runs) for finding in findings])
+
+
+def findings_from_json(text: str) -> tuple[Finding, ...]:
+    """Inverse of `findings_to_json`. Raises ValueError or RecursionError on anything else."""
+    return msgspec.convert(json.loads(text), tuple[Finding, ...], dec_hook=_rows_of_runs)
+
+
+def _rows_of_runs(kind: type, value: Any) -> NDArray[np.int64]:
+    """Rows of a fix: the only numpy array in a finding."""
+    runs = msgspec.convert(value, list[tuple[int, int]])
+    if any(a < 0 or b < a for a, b in runs) or sum(b - a for a, b in runs) > _MOST_ROWS:
+        raise ValueError("not rows")
+    return np.concatenate([np.empty(0, np.int64), *(np.arange(a, b) for a, b in runs)]).astype(np.int64)
+
+
+def _runs(rows: NDArray[np.int64]) -> list[list[int]]:
+    """[first, last + 1] of each run of consecutive numbers, in the given order."""
+    if not rows.size:
+        return []
+    breaks = np.flatnonzero(np.diff(rows) != 1) + 1
+    starts, ends = rows[np.r_[0, breaks]], rows[np.r_[breaks - 1, rows.size - 1]] + 1
+    return [[int(a), int(b)] for a, b in zip(starts, ends, strict=True)]

@@ -19,15 +19,16 @@ from numpy.typing import NDArray
 from crazyem.atomic_file import new_file
 from crazyem.recordings.finding import Grade
 from crazyem.recordings.mcap import schemas
-from crazyem.recordings.mcap.findings import IMPORT_METADATA, findings_to_json
 from crazyem.recordings.mcap.output import Output
 from crazyem.recordings.mcap.schemas import (
     EVENT_TOPICS,
     FINDINGS_TOPIC,
+    IMPORT_METADATA,
     OTHER_EVENT_TOPIC,
     POSE_PERIOD,
     PROFILE,
     fields_of,
+    findings_to_json,
     pose_messages,
     versions,
 )

@@ -109,7 +109,7 @@ class RecordingWriter:
         self._thread.start()
 
     def _reopen(self, path: Path) -> None:
-        from crazyem.recordings.mcap.append import reopen
+        from crazyem.recordings.mcap.output import reopen
 
         before = reopen(path)
         self._file = before.stream
