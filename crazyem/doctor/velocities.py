@@ -1,15 +1,6 @@
 """Check: velocity against the derivative of position, and positions of two origins: unit, frame, sign, scale."""
 
-from crazyem.doctor.hypotheses import (
-    Comparison,
-    agreed_scale,
-    compare_hypotheses,
-    known_factor,
-    misread,
-    slope_numbers,
-    wrong_scale,
-    wrong_unit,
-)
+from crazyem.doctor import hypotheses
 from crazyem.doctor.kinematics import Track, difference, grid_of, measurements, poses, track, width_for
 from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Grade
@@ -44,7 +35,9 @@ def check(recording: Recording) -> list[Finding]:
     return found
 
 
-def _compare(array: SignalArray, other: str, reference: SignalArray, attitudes: list[SignalArray]) -> Comparison | None:
+def _compare(
+    array: SignalArray, other: str, reference: SignalArray, attitudes: list[SignalArray]
+) -> hypotheses.Comparison | None:
     grid = grid_of(array, reference, *attitudes)
     world = difference(track(reference, grid))
     candidates: dict[str, tuple[int, Track]] = {"world": (0, world)}
@@ -53,18 +46,20 @@ def _compare(array: SignalArray, other: str, reference: SignalArray, attitudes: 
         turned = rotate(attitude.value, world.value, inverse=True)
         candidates["body"] = (1, Track(turned, world.valid & attitude.valid))
     width = max(VELOCITY_WINDOW, width_for(array, reference))
-    return compare_hypotheses(array, grid, other, candidates, width=width, least=LEAST_VELOCITY_RMS, offset=False)
+    return hypotheses.compare_hypotheses(
+        array, grid, other, candidates, width=width, least=LEAST_VELOCITY_RMS, offset=False
+    )
 
 
-def _compare_positions(array: SignalArray, other: str, reference: SignalArray) -> Comparison | None:
+def _compare_positions(array: SignalArray, other: str, reference: SignalArray) -> hypotheses.Comparison | None:
     """Comparison of positions, not of their derivatives: late packets distort the scale of a derivative."""
     grid = grid_of(array, reference)
     candidates = {"world": (0, track(reference, grid))}
     width = max(VELOCITY_WINDOW, width_for(array, reference))
-    return compare_hypotheses(array, grid, other, candidates, width=width, least=LEAST_POSITION_RMS)
+    return hypotheses.compare_hypotheses(array, grid, other, candidates, width=width, least=LEAST_POSITION_RMS)
 
 
-def _judge(name: str, looks: list[Comparison], blamed: set[str]) -> list[Finding]:
+def _judge(name: str, looks: list[hypotheses.Comparison], blamed: set[str]) -> list[Finding]:
     if not looks:
         return []
     best = max(looks, key=lambda one: one.explained)
@@ -74,47 +69,47 @@ def _judge(name: str, looks: list[Comparison], blamed: set[str]) -> list[Finding
     head = f"{name} against the derivative of {best.against}: "
     evidence = best.evidence()
     if best.choice.denied:
-        return [misread("velocities", name, best, _MISREAD, noun="world")]
-    unit = known_factor(whole, VELOCITY_UNITS)
+        return [hypotheses.misread("velocities", name, best, _MISREAD, noun="world")]
+    unit = hypotheses.known_factor(whole, VELOCITY_UNITS)
     if unit:
         text = f"{head}it is {whole.value:.4g} times as large: it is in {unit[0]}, not m/s."
-        return [wrong_unit("velocities", name, text, unit[1], evidence)]
-    unit = known_factor(whole, POSITION_UNITS)
+        return [hypotheses.wrong_unit("velocities", name, text, unit[1], evidence)]
+    unit = hypotheses.known_factor(whole, POSITION_UNITS)
     if unit:
         if best.against in blamed:
             return []
         blamed.add(best.against)
         text = f"The derivative of {best.against} is {1 / whole.value:.4g} times {name}: it is in {unit[0]}, not m."
-        return [wrong_unit("velocities", best.against, text, 1.0 / unit[1], evidence)]
-    return wrong_scale(
+        return [hypotheses.wrong_unit("velocities", best.against, text, 1.0 / unit[1], evidence)]
+    return hypotheses.wrong_scale(
         "velocities", name, looks, SCALE_FAULT,
         alone="One of the two is wrong, and a third measurement must say which.",
         agreed="Positions of two origins agree against it: divide the velocity by the factor.",
     )  # fmt: skip
 
 
-def _judge_position(name: str, seen: Comparison, blamed: set[str]) -> list[Finding]:
+def _judge_position(name: str, seen: hypotheses.Comparison, blamed: set[str]) -> list[Finding]:
     whole = seen.whole
     if whole is None or seen.explained < LEAST_EXPLAINED_SHARE:
         return []
     head = f"{name} against {seen.against}: "
     if seen.choice.denied:
-        return [misread("velocities", name, seen, _MISREAD, noun="world", what="")]
-    unit = known_factor(whole, POSITION_UNITS)
+        return [hypotheses.misread("velocities", name, seen, _MISREAD, noun="world", what="")]
+    unit = hypotheses.known_factor(whole, POSITION_UNITS)
     if unit:
         blamed.add(seen.against)
         text = (
             f"{seen.against} against {name}: it is {1.0 / whole.value:.4g} times as large: it is in {unit[0]}, not m."
         )
-        return [wrong_unit("velocities", seen.against, text, 1.0 / unit[1], seen.evidence())]
-    unit = known_factor(whole, {key: 1.0 / factor for key, factor in POSITION_UNITS.items()})
+        return [hypotheses.wrong_unit("velocities", seen.against, text, 1.0 / unit[1], seen.evidence())]
+    unit = hypotheses.known_factor(whole, {key: 1.0 / factor for key, factor in POSITION_UNITS.items()})
     if unit:
         text = f"{head}it is {whole.value:.4g} times as large: it is in {unit[0]}, not m."
-        return [wrong_unit("velocities", name, text, unit[1], seen.evidence())]
-    agreed = agreed_scale([seen], SCALE_FAULT)
+        return [hypotheses.wrong_unit("velocities", name, text, unit[1], seen.evidence())]
+    agreed = hypotheses.agreed_scale([seen], SCALE_FAULT)
     if agreed is None:
         return []
-    numbers = {**seen.evidence(), **slope_numbers(seen.single)}
+    numbers = {**seen.evidence(), **hypotheses.slope_numbers(seen.single)}
     text = f"{name} and {seen.against} differ in scale: {agreed[1].text}, if {seen.against} is right."
     advice = "Find out which of the two is calibrated."
     return [Finding("velocities", Grade.DEGRADES, text, name, (), numbers, advice)]

@@ -7,7 +7,9 @@ Python prints them, so every float is exact. Rows are in order of arrival; the f
 """
 
 import contextlib
+import io
 import re
+from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -235,40 +237,21 @@ def _segments(
 
 def _numbers(path: Path, text: bytes, width: int, line: int) -> NDArray[np.float64]:
     """(n, width) of comma-separated text whose first line is number `line` of the file."""
-    if not text.strip():
-        return np.empty((0, width))
-    from pyarrow import ArrowInvalid, csv, float64, py_buffer
-
-    names = [str(i) for i in range(width)]
-    try:
-        table = csv.read_csv(
-            py_buffer(text),
-            csv.ReadOptions(column_names=names, use_threads=False),
-            csv.ParseOptions(quote_char=False),
-            csv.ConvertOptions(column_types=dict.fromkeys(names, float64()), null_values=[], strings_can_be_null=False),
-        )
-    except ArrowInvalid:
-        return _plain_numbers(path, text, width, line)
-    return np.column_stack([table.column(name).to_numpy() for name in names])
-
-
-def _plain_numbers(path: Path, text: bytes, width: int, line: int) -> NDArray[np.float64]:
-    """As `_numbers`, row by row, so that an error names its line."""
-    rows = []
-    for number, row in enumerate(text.split(b"\n"), start=line):
+    numbers = array("d")
+    for number, row in enumerate(io.BytesIO(text), start=line):
         if not row.strip():
             continue
-        fields = row.decode("latin-1").split(",")
+        fields = row.rstrip(b"\n").split(b",")
         if len(fields) != width:
             raise FileFormatError(f"{path}: line {number} has {len(fields)} fields, the header has {width}.")
         try:
-            if "_" in "".join(fields):
+            if b"_" in row:
                 raise ValueError
-            rows.append([float(field) for field in fields])
+            numbers.extend(map(float, fields))
         except ValueError:
-            shown = ascii(row[:40].decode("latin-1"))
+            shown = ascii(row[:40].decode("latin-1").rstrip("\n"))
             raise FileFormatError(f"{path}: line {number} holds something that is not a number: {shown}.") from None
-    return np.array(rows, float).reshape(len(rows), width)
+    return np.array(numbers, float).reshape(-1, width)
 
 
 def _unwrapped(stamp: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -132,7 +132,6 @@ def _meeting(
 
 Array = NDArray[np.float64]
 _HARMLESS_SHARE = 0.05  # of rows drawn across lost packets
-_CHUNK_ROWS = 1 << 16  # rows turned together, to bound memory
 _SQRT_HALF = math.sqrt(0.5)
 _NED_TO_ENU = (_SQRT_HALF, _SQRT_HALF, 0.0, 0.0)  # x y z w: half a turn about the bisector of north and east
 _FLU_TO_FRD = (1.0, 0.0, 0.0, 0.0)  # half a turn about x

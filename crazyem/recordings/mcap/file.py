@@ -28,11 +28,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
     Raises: FileFormatError if the file has no log data of crazyem.
     """
-    reading = _Reading(path, options)
-    for part in reading.parts():
-        reading.take(part)
-    reading.check()
-    return reading.recording()
+    return next(read_parts(path, options, math.inf))
 
 
 def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Iterator[Recording]:
@@ -44,8 +40,11 @@ def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Itera
 
     Raises: as `read`, with the first part.
     """
-    reading = _Reading(path, options, in_parts=True)
-    if not reading.announced:  # cut off, so without a summary: the channels are known only after a pass over the file
+    in_parts = seconds < math.inf
+    reading = _Reading(path, options, in_parts=in_parts)
+    if (
+        in_parts and not reading.announced
+    ):  # cut off, so without a summary: the channels are known only after a pass over the file
         for part in parts(path, []):
             reading.announced.extend(part.announced)
     reading.content.announce(reading.announced)
@@ -58,7 +57,7 @@ def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Itera
         times = part.scan.messages[:, 3]
         begun = int(times[0]) if begun is None else begun
         size += part.scan.data.size
-        if int(times[-1]) - begun >= seconds * 1e9 or size >= _PART_BYTES:
+        if in_parts and (int(times[-1]) - begun >= seconds * 1e9 or size >= _PART_BYTES):
             yield reading.recording()
             begun, size, first = None, 0, False
     if first:

@@ -20,18 +20,6 @@ from crazyem.atomic_file import new_file
 from crazyem.recordings.finding import Grade
 from crazyem.recordings.mcap import schemas
 from crazyem.recordings.mcap.output import Output
-from crazyem.recordings.mcap.schemas import (
-    EVENT_TOPICS,
-    FINDINGS_TOPIC,
-    IMPORT_METADATA,
-    OTHER_EVENT_TOPIC,
-    POSE_PERIOD,
-    PROFILE,
-    fields_of,
-    findings_to_json,
-    pose_messages,
-    versions,
-)
 from crazyem.recordings.mcap.stream_codec import MOST_FIELDS, MOST_SIGNALS, Column, StreamLayout, unique_name
 from crazyem.recordings.recording import Event, Recording, SignalArray
 from crazyem.recordings.topics import ranks
@@ -56,15 +44,15 @@ def write_recording(recording: Recording, path: str | Path, *, replace: bool = F
 
 
 def _write(recording: Recording, output: Output) -> None:
-    output.start(PROFILE, f"crazyem {versions()['crazyem']}")
+    output.start(schemas.PROFILE, f"crazyem {schemas.versions()['crazyem']}")
     own = {
-        **versions(),
+        **schemas.versions(),
         "origin": repr(float(recording.origin)),
         "source": recording.source,
         "path": recording.path,
-        "findings": findings_to_json(recording.findings),
+        "findings": schemas.findings_to_json(recording.findings),
     }
-    output.metadata(IMPORT_METADATA, own)
+    output.metadata(schemas.IMPORT_METADATA, own)
     for section, entries in recording.metadata.items():
         output.metadata(section, entries)
     # place of each sample among all samples of the recording, in processing order
@@ -266,7 +254,7 @@ def _poses(
     extras, newest = [], -math.inf
     for row in np.argsort(places["position"]).tolist():
         time = float(position.time[row])
-        if not abs(time - newest) >= POSE_PERIOD:
+        if not abs(time - newest) >= schemas.POSE_PERIOD:
             continue
         # the latest attitude at the position, or the next sample in processing order
         at = int(np.searchsorted(known, places["position"][row] + 1, side="right")) - 1
@@ -278,7 +266,7 @@ def _poses(
         translation = dict(zip("xyz", position.value[row].tolist(), strict=True))
         nanoseconds = int(min(max(stamp, 0.0), 9.0e18))
         key = float(places["position"][row]) + 0.25
-        for topic, schema, fields in pose_messages(nanoseconds, translation, rotation):
+        for topic, schema, fields in schemas.pose_messages(nanoseconds, translation, rotation):
             extras.append(_Extra(_channel(output, topic, schema), schemas.encode(schema, fields), nanoseconds, key))
     return extras
 
@@ -287,10 +275,10 @@ def _events(output: Output, recording: Recording, clock: _Clock) -> list[_Extra]
     """Events as messages of their own kind if this is lossless, else as JSON."""
     extras = []
     for event in recording.events:
-        topic, schema = EVENT_TOPICS.get(event.kind, OTHER_EVENT_TOPIC)
+        topic, schema = schemas.EVENT_TOPICS.get(event.kind, schemas.OTHER_EVENT_TOPIC)
         data = _native(event)
         if data is None:
-            topic, schema = OTHER_EVENT_TOPIC
+            topic, schema = schemas.OTHER_EVENT_TOPIC
             fields = {"time": event.time, "kind": event.kind, "json": json.dumps(dict(event.data), default=str)}
             data = schemas.encode(schema, fields)
         stamp = _nanoseconds(event.time)
@@ -301,12 +289,12 @@ def _events(output: Output, recording: Recording, clock: _Clock) -> list[_Extra]
 
 def _native(event: Event) -> bytes | None:
     """The event as a message of its own kind, None if this would lose data."""
-    if event.kind not in EVENT_TOPICS or _nanoseconds(event.time) / 10**9 != event.time:
+    if event.kind not in schemas.EVENT_TOPICS or _nanoseconds(event.time) / 10**9 != event.time:
         return None
-    schema = EVENT_TOPICS[event.kind][1]
+    schema = schemas.EVENT_TOPICS[event.kind][1]
     try:
         data = schemas.encode(schema, event.data)
-        same = repr(fields_of(schemas.message_class(schema).FromString(data))) == repr(dict(event.data))
+        same = repr(schemas.fields_of(schemas.message_class(schema).FromString(data))) == repr(dict(event.data))
     except (TypeError, ValueError, AttributeError):
         return None
     return data if same else None
@@ -327,6 +315,6 @@ def _notes(output: Output, recording: Recording) -> list[_Extra]:
             "message": f"{finding.signal}: {finding.text}" if finding.signal else finding.text,
             "name": finding.check,
         }
-        channel = _channel(output, FINDINGS_TOPIC, "foxglove.Log")
+        channel = _channel(output, schemas.FINDINGS_TOPIC, "foxglove.Log")
         extras.append(_Extra(channel, schemas.encode("foxglove.Log", fields), log_time=0))
     return extras

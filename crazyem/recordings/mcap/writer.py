@@ -16,15 +16,6 @@ from crazyem.errors import UsageError
 from crazyem.links.base import LinkStatistics, ParameterWrite
 from crazyem.recordings.mcap import schemas
 from crazyem.recordings.mcap.output import Output
-from crazyem.recordings.mcap.schemas import (
-    EVENT_TOPICS,
-    FRAMES_TOPIC,
-    POSE_PERIOD,
-    PROFILE,
-    pose_messages,
-    timestamp,
-    versions,
-)
 from crazyem.signals.sample import Block, Packet, Sample
 from crazyem.signals.vocabulary import BlockDecoder, decoders
 
@@ -119,8 +110,8 @@ class RecordingWriter:
 
     def _begin(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
         if self.session == 1:
-            self._output.start(PROFILE, f"crazyem {versions()['crazyem']}")
-        self._write_metadata("crazyem", versions())
+            self._output.start(schemas.PROFILE, f"crazyem {schemas.versions()['crazyem']}")
+        self._write_metadata("crazyem", schemas.versions())
         for section, entries in metadata.items():
             self._write_metadata(section, {k: str(v) for k, v in entries.items()})
         self._output.flush(sync=True)
@@ -265,13 +256,15 @@ class RecordingWriter:
             return
         self._message(known[0], packet.host_time, known[1].encode(packet))
         decoder = self._decoders.get(packet.block)
-        if decoder is not None and packet.firmware_time_ms / 1000.0 - self._pose_time >= POSE_PERIOD:
+        if decoder is not None and packet.firmware_time_ms / 1000.0 - self._pose_time >= schemas.POSE_PERIOD:
             self._write_pose(decoder.decode(packet))
 
     def _write_frame(self, host_time: float, data: bytes) -> None:
-        if FRAMES_TOPIC not in self._channels:
-            self._channels[FRAMES_TOPIC] = self._output.channel(FRAMES_TOPIC, "mavlink", 0)  # 0: there is no schema
-        self._message(self._channels[FRAMES_TOPIC], host_time, data)
+        if schemas.FRAMES_TOPIC not in self._channels:
+            self._channels[schemas.FRAMES_TOPIC] = self._output.channel(
+                schemas.FRAMES_TOPIC, "mavlink", 0
+            )  # 0: there is no schema
+        self._message(self._channels[schemas.FRAMES_TOPIC], host_time, data)
 
     def _write_pose(self, samples: list[Sample]) -> None:
         """foxglove.PoseInFrame and FrameTransform, for the 3D panels of viewers."""
@@ -287,7 +280,7 @@ class RecordingWriter:
         host_time = position.host_time
         translation = dict(zip("xyz", position.value, strict=True))
         rotation = dict(zip("xyzw", self._attitude, strict=True))
-        for topic, schema, fields in pose_messages(_nanoseconds(host_time), translation, rotation):
+        for topic, schema, fields in schemas.pose_messages(_nanoseconds(host_time), translation, rotation):
             self._write(topic, schema, host_time, fields)
 
     def _write_setpoint(self, time: float, host_time: float, reference: Setpoint) -> None:
@@ -295,7 +288,7 @@ class RecordingWriter:
         for what in ("position", "velocity", "acceleration"):
             for axis, value in zip("xyz", getattr(reference, what), strict=True):
                 fields[f"{what}_{axis}"] = float(value)
-        self._write(*EVENT_TOPICS["setpoint"], host_time, fields)
+        self._write(*schemas.EVENT_TOPICS["setpoint"], host_time, fields)
 
     def _write_parameter(self, write: ParameterWrite) -> None:
         fields = {
@@ -305,7 +298,7 @@ class RecordingWriter:
             "echoed": math.nan if write.echoed is None else float(write.echoed),
             "verified": write.verified,
         }
-        self._write(*EVENT_TOPICS["parameter_write"], write.host_time, fields)
+        self._write(*schemas.EVENT_TOPICS["parameter_write"], write.host_time, fields)
 
     def _write_estimate(self, host_time: float, estimate: "Estimate") -> None:
         parameters = [
@@ -329,7 +322,7 @@ class RecordingWriter:
             "updates": int(estimate.updates),
             "converged": bool(estimate.converged),
         }
-        self._write(*EVENT_TOPICS["estimate"], host_time, fields)
+        self._write(*schemas.EVENT_TOPICS["estimate"], host_time, fields)
 
     def _write_link(self, host_time: float, statistics: LinkStatistics, latency: float) -> None:
         names = ("received", "lost", "late", "round_trip", "clock_offset", "clock_rate", "outages")
@@ -341,18 +334,18 @@ class RecordingWriter:
             fields["rate"] = received / (host_time - before[0])
             fields["loss"] = lost / (received + lost) if received + lost > 0 else math.nan
         self._link_before = (host_time, statistics.received, statistics.lost)
-        self._write(*EVENT_TOPICS["link"], host_time, fields)
+        self._write(*schemas.EVENT_TOPICS["link"], host_time, fields)
 
     def _write_residual(self, time: float, host_time: float, values: tuple[float, ...], sd: tuple[float, ...]) -> None:
         fields = {"time": float(time), "host_time": host_time}
         for name, value, deviation in zip(schemas.RESIDUALS.split(), values, sd, strict=True):
             fields |= {name: value, f"{name}_sd": deviation}
-        self._write(*EVENT_TOPICS["residual"], host_time, fields)
+        self._write(*schemas.EVENT_TOPICS["residual"], host_time, fields)
 
     def _write_event(self, host_time: float, text: str, level: str) -> None:
-        stamp = timestamp(_nanoseconds(host_time))
+        stamp = schemas.timestamp(_nanoseconds(host_time))
         fields = {"timestamp": stamp, "level": level, "message": text, "name": "crazyem"}
-        self._write(*EVENT_TOPICS["log"], host_time, fields)
+        self._write(*schemas.EVENT_TOPICS["log"], host_time, fields)
 
     def _write(self, topic: str, schema: str, host_time: float, fields: dict[str, Any]) -> None:
         self._message(self._channel(topic, schema), host_time, schemas.encode(schema, fields))

@@ -17,20 +17,7 @@ from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.motor_meaning import MOTOR_VARIABLES
 from crazyem.recordings.recording import Event, Recording
 from crazyem.recordings.tables import Table, signals_from_tables
-from crazyem.recordings.usd.format import (
-    BLANK_BYTES,
-    LONGEST_NAME,
-    MOST_EVENTS,
-    USD_MAGIC,
-    Clock,
-    Header,
-    Records,
-    gather,
-    locate,
-    parse_header,
-    table,
-)
-
+from crazyem.recordings.usd import format as usd_format
 
 CRC_BYTES = 4
 _READ_BYTES = 1 << 22  # bytes read at a time
@@ -44,11 +31,16 @@ _Piece = tuple[NDArray[np.float64], NDArray[np.uint16], Packed]  # times and kin
 
 def recognises(head: bytes) -> bool:
     """True if these first bytes have the form of a log header with a named first event."""
-    if len(head) < 8 or head[0] != USD_MAGIC:
+    if len(head) < 8 or head[0] != usd_format.USD_MAGIC:
         return False
     version, count = struct.unpack_from("<HH", head, 1)
-    name = head[7 : 7 + LONGEST_NAME].split(b"\0", 1)[0]
-    return 0 < version < 16 and 0 < count <= MOST_EVENTS and name.isascii() and name.decode("ascii").isprintable()
+    name = head[7 : 7 + usd_format.LONGEST_NAME].split(b"\0", 1)[0]
+    return (
+        0 < version < 16
+        and 0 < count <= usd_format.MOST_EVENTS
+        and name.isascii()
+        and name.decode("ascii").isprintable()
+    )
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
@@ -86,7 +78,7 @@ def _recordings(path: Path, options: ReadOptions, *, seconds: float, largest: fl
     findings = meaning.findings
     for part in stretches(survey, seconds, largest):
         tables = [
-            table(event, values, part.time[rows], part.first + rows)
+            usd_format.table(event, values, part.time[rows], part.first + rows)
             for event, values, rows, count in zip(header.events, part.packed, part.order, survey.counts, strict=True)
             if count and event.variables
         ]
@@ -103,14 +95,16 @@ def _recordings(path: Path, options: ReadOptions, *, seconds: float, largest: fl
         findings = ()
 
 
-def _events(header: Header, order: Sequence[NDArray[np.intp]], time: NDArray[np.float64]) -> tuple[Event, ...]:
+def _events(
+    header: usd_format.Header, order: Sequence[NDArray[np.intp]], time: NDArray[np.float64]
+) -> tuple[Event, ...]:
     """Events without variables."""
     bare = [(i, event.name) for i, event in enumerate(header.events) if not event.variables]
     rows = sorted((int(row), name) for i, name in bare for row in order[i])
     return tuple(Event(float(time[row]), "log", {"name": name, "clock": "firmware"}) for row, name in rows)
 
 
-def _metadata(header: Header, counts: Sequence[int], verdict: str) -> dict[str, str]:
+def _metadata(header: usd_format.Header, counts: Sequence[int], verdict: str) -> dict[str, str]:
     """The section "usd": data of the header, number of records of each kind, result of the CRC check."""
     section = {"version": str(header.version), "crc": verdict, "events": " ".join(e.name for e in header.events)}
     for event, count in zip(header.events, counts, strict=True):
@@ -144,7 +138,7 @@ class Survey:
         samples = {k: _Sample() for k, e in enumerate(self.header.events) if set(MOTOR_VARIABLES) <= set(e.variables)}
         tail = b""
         self.size, computed = 0, 0
-        blanks = dict.fromkeys(BLANK_BYTES, 0)  # blank byte -> end of the last other byte
+        blanks = dict.fromkeys(usd_format.BLANK_BYTES, 0)  # blank byte -> end of the last other byte
         for piece in pieces(path, _READ_BYTES):
             blanks = {b: self.size + len(r) if (r := piece.rstrip(b)) else at for b, at in blanks.items()}
             self.size += len(piece)
@@ -158,7 +152,7 @@ class Survey:
         for begin, data, records in _walk(self):
             self.stop, self.unknown = begin + records.stop, records.unknown
             for k, sample in samples.items():
-                sample.add(gather(data, self.header.events[k], records.start[records.order[k]]))
+                sample.add(usd_format.gather(data, self.header.events[k], records.start[records.order[k]]))
             self.counts = [n + rows.size for n, rows in zip(self.counts, records.order, strict=True)]
         self._samples = {k: sample.rows(self.header.events[k].layout) for k, sample in samples.items()}
 
@@ -207,7 +201,7 @@ class Survey:
         for k, (event, count) in enumerate(zip(self.header.events, self.counts, strict=True)):
             if count and event.variables:
                 rows = self._samples.get(k, np.empty(0, event.layout))
-                result.append(table(event, rows, np.zeros(rows.size), np.arange(rows.size)))
+                result.append(usd_format.table(event, rows, np.zeros(rows.size), np.arange(rows.size)))
         return result
 
 
@@ -246,12 +240,12 @@ def stretches(survey: Survey, seconds: float, largest: float = STRETCH_BYTES) ->
     """The records of a file in stretches of at least `seconds`, or of `largest` bytes if earlier."""
     header = survey.header
     total, first, begin, held_bytes = sum(survey.counts), 0, 0.0, 0
-    clock = Clock(header)
+    clock = usd_format.Clock(header)
     held: list[_Piece] = []
     rows = 0
     for _, data, records in _walk(survey):
         order = records.order
-        packed = [gather(data, e, records.start[r]) for e, r in zip(header.events, order, strict=True)]
+        packed = [usd_format.gather(data, e, records.start[r]) for e, r in zip(header.events, order, strict=True)]
         time = clock.seconds(order, [p["stamp"] for p in packed])
         at = 0
         while at < time.size:
@@ -277,7 +271,7 @@ def _cut(piece: _Piece, order: Sequence[NDArray[np.intp]], at: int, end: int) ->
     return time[at:end], kind[at:end], [p[a:b].copy() for p, (a, b) in zip(packed, places, strict=True)]
 
 
-def _joined(header: Header, held: list[_Piece], first: int, ends: bool) -> Stretch:
+def _joined(header: usd_format.Header, held: list[_Piece], first: int, ends: bool) -> Stretch:
     kind = np.concatenate([k for _, k, _ in held])
     packed = []
     for number, event in enumerate(header.events):
@@ -288,7 +282,7 @@ def _joined(header: Header, held: list[_Piece], first: int, ends: bool) -> Stret
     return Stretch(first, np.concatenate([t for t, _, _ in held]), order, packed, ends)
 
 
-def _walk(survey: Survey) -> Iterator[tuple[int, bytes, Records]]:
+def _walk(survey: Survey) -> Iterator[tuple[int, bytes, usd_format.Records]]:
     """For each piece of the file: (its offset, its bytes, the whole records in it)."""
     header = survey.header
     end = survey.size - (CRC_BYTES if survey.right else 0)
@@ -298,20 +292,20 @@ def _walk(survey: Survey) -> Iterator[tuple[int, bytes, Records]]:
         data += piece
         if len(data) <= skip:
             continue
-        records = locate(data, header.events, skip, min(len(data), end - begin), survey.blank - begin)
+        records = usd_format.locate(data, header.events, skip, min(len(data), end - begin), survey.blank - begin)
         yield begin, data, records
         if records.unknown is not None or begin + records.stop >= survey.blank:
             return
         data, begin, skip = data[records.stop :], begin + records.stop, 0
 
 
-def _header(path: Path) -> Header:
+def _header(path: Path) -> usd_format.Header:
     data = b""
     for piece in pieces(path, _READ_BYTES):
         data += piece
         try:
-            return parse_header(data, path)
+            return usd_format.parse_header(data, path)
         except FileFormatError:
             if len(data) > _LONGEST_HEADER:
                 raise
-    return parse_header(data, path)
+    return usd_format.parse_header(data, path)
