@@ -13,9 +13,8 @@ from crazyem.doctor.hypotheses import sign_factor, signed
 from crazyem.doctor.regression import Choice, blocks, choose, slope
 from crazyem.physics.rotations import euler_from_quaternion, rotate
 from crazyem.recordings.finding import Finding, Fix, Grade, runs_of
+from crazyem.recordings.ordering import Array
 from crazyem.recordings.recording import Recording, SignalArray
-
-Array = NDArray[np.float64]
 
 DEGREES = 180.0 / math.pi
 ANGLE_UNITS = {"degrees": DEGREES, "converted": 1.0 / DEGREES}

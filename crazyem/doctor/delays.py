@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from crazyem.doctor.kinematics import GRID_STEP, Track
 from crazyem.doctor.regression import jackknife_error
-
-Array = NDArray[np.float64]
+from crazyem.recordings.ordering import Array
 
 LARGEST_LAG = 0.3  # s, largest lag of the search, on either side
 COARSE_LAG_STEP = 3  # grid steps between lags tried at first

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from crazyem.recordings.finding import Finding, Grade
-from crazyem.recordings.ordering import sound_samples
+from crazyem.recordings.ordering import Array, sound_samples
 from crazyem.recordings.recording import Recording, SignalArray
 
-Array = NDArray[np.float64]
 Hashes = NDArray[np.uint32]
 
 TURNING_POINT_NEIGHBOURS = 6  # samples on each side that a turning point is compared with

@@ -19,10 +19,9 @@ from crazyem.doctor.kinematics import turn
 from crazyem.doctor.regression import AUTOREGRESSION_ORDER, Fit, autoregression, filtered, long_run, widened
 from crazyem.physics.lag import CAUSAL, LINEAR, fit_predictor, hold_predictor, lagged_means
 from crazyem.recordings.airborne import Airtime
+from crazyem.recordings.ordering import Array
 from crazyem.recordings.thrust import Inputs
 from crazyem.vehicle import GRAVITY, Vehicle
-
-Array = NDArray[np.float64]
 
 FINEST_STEP = 4e-3  # s; faster streams are averaged into steps of 5 ms
 AVERAGED_STEP = 5e-3

@@ -16,9 +16,8 @@ from crazyem.doctor.delays import delay
 from crazyem.doctor.kinematics import Grid, Track, Window, track
 from crazyem.doctor.regression import Choice, Slope, blocks, choose, slope
 from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.ordering import Array
 from crazyem.recordings.recording import SignalArray
-
-Array = NDArray[np.float64]
 
 SLOPE_WINDOW = 0.5  # s, window for slopes: filters of streams do not change motion this slow
 ROW_STRIDE = 3  # grid steps between rows; more in recordings of more than a few minutes

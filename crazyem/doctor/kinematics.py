@@ -19,11 +19,9 @@ from crazyem.physics.rotations import (
     quaternion_product,
     rotation_vector_from_quaternion,
 )
+from crazyem.recordings.ordering import Array, Flags
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.signals.sample import SIGNALS
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 GRID_STEP = 0.01  # s, of the grid
 LONGEST_GRID_SECONDS = 900.0  # s; of longer recordings only this part, about the middle, is used
@@ -129,7 +127,7 @@ class Track:
     """Values (m, c) on a grid, and where they are valid (m,)."""
 
     value: Array
-    valid: Mask
+    valid: Flags
 
     def part(self, rows: slice) -> "Track":
         return Track(self.value[rows], self.valid[rows])
@@ -211,7 +209,7 @@ def difference(given: Track) -> Track:
     return Track(value, _inner(given.valid))
 
 
-def _inner(valid: Mask) -> Mask:
+def _inner(valid: Flags) -> Flags:
     """Where two neighbours on either side are valid, too."""
     out = np.zeros(valid.size, bool)
     if valid.size >= 5:
@@ -251,7 +249,7 @@ def _cubic(time: Array, value: Array, at: Array, i: NDArray[np.int64]) -> Array:
     return np.asarray(ends + h * u * v * (v * slope[i] - u * slope[i + 1]), float)
 
 
-def _sound(array: SignalArray) -> Mask:
+def _sound(array: SignalArray) -> Flags:
     """(n,) samples that have a time and all components, with plausible sizes."""
     sound = np.isfinite(array.time)
     sound &= ~array.marked

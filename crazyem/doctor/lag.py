@@ -9,15 +9,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from crazyem.doctor import kinematics
 from crazyem.doctor.delays import LARGEST_LAG, delay, spread
 from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.ordering import Array
 from crazyem.recordings.recording import Recording, SignalArray
-
-Array = NDArray[np.float64]
 
 LAG_CONFIDENCE = 0.995  # one-sided confidence level of a significant lag
 REPORTED_LAG = 0.003  # s, smallest reported lag

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
-Array = NDArray[np.float64]
+from crazyem.recordings.ordering import Array
 
 BLOCK_SECONDS = 1.5  # s
 MOST_BLOCKS = 60  # most blocks; long recordings have longer blocks

@@ -30,9 +30,8 @@ from crazyem.doctor.kinematics import (
 from crazyem.doctor.regression import FEWEST_BLOCKS, SLOPE_CONFIDENCE, blocks, jackknife_error
 from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Grade
+from crazyem.recordings.ordering import Array
 from crazyem.recordings.recording import Recording, SignalArray
-
-Array = NDArray[np.float64]
 
 REPORTED_TILT = math.radians(0.5)  # smallest reported tilt
 DEGRADING_TILT = math.radians(1.5)  # tilt that degrades results

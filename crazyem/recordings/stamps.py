@@ -19,10 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.ordering import Array, Flags
 from crazyem.recordings.recording import Recording, SignalArray
-
-Column = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 LONGEST_RECORDING = 86_400.0  # s; no recording of a flight is longer than a day
 RESTART_SECONDS = 1.0  # s; a larger step back is a clock that was set or restarted, a smaller one a late record
@@ -41,7 +39,7 @@ class Fault:
     example: float  # one of the stamps [s], as in the file; for "shifted": the shift [s]
 
 
-def impossible(time: Column, *, centre: float | None = None, absent: float | None = None) -> Flags:
+def impossible(time: Array, *, centre: float | None = None, absent: float | None = None) -> Flags:
     """(n,) True for impossible stamps.
 
     Args:
@@ -63,12 +61,12 @@ def impossible(time: Column, *, centre: float | None = None, absent: float | Non
     return bad
 
 
-def _sound(time: Column) -> bool:
+def _sound(time: Array) -> bool:
     """Whether all stamps are possible: in order, and no longer than a recording can be."""
     return time.size < 2 or bool((np.diff(time) >= 0).all() and time[-1] - time[0] <= LONGEST_RECORDING)
 
 
-def out_of_order(time: Column) -> Flags:
+def out_of_order(time: Array) -> Flags:
     """(n,) True where a stamp breaks the order of those around it and is far from their median."""
     if time.size < 3 or bool((np.diff(time) >= 0).all()):
         return np.zeros(time.size, bool)
@@ -84,7 +82,7 @@ def out_of_order(time: Column) -> Flags:
     return _without_those_in_order(time, far & broken, away)
 
 
-def _without_those_in_order(time: Column, odd: Flags, away: Column) -> Flags:
+def _without_those_in_order(time: Array, odd: Flags, away: Array) -> Flags:
     """Clear the flags of stamps that fit between the unflagged ones, in the order of their distance to the median."""
     kept = np.flatnonzero(~odd).tolist()
     for row in sorted(np.flatnonzero(odd).tolist(), key=lambda row: away[row]):
@@ -98,13 +96,13 @@ def _without_those_in_order(time: Column, odd: Flags, away: Column) -> Flags:
     return found
 
 
-def _running_median(time: Column) -> Column:
+def _running_median(time: Array) -> Array:
     from scipy.ndimage import median_filter  # slow to import and rarely needed
 
     return np.asarray(median_filter(time, 2 * _NEIGHBOURS + 1, mode="mirror"), float)
 
 
-def restarts(time: Column) -> NDArray[np.int64]:
+def restarts(time: Array) -> NDArray[np.int64]:
     """Rows (k,) at which a clock restarts, from (n,) stamps [s] of one or more streams in order of arrival.
 
     The running median shows a restart; a few late or impossible stamps do not change the median.
@@ -120,7 +118,7 @@ def restarts(time: Column) -> NDArray[np.int64]:
     return np.unique(np.array(rows, np.int64))
 
 
-def clock_offset(time: Column, place: Column, others: Column, places: Column) -> float | None:
+def clock_offset(time: Array, place: Array, others: Array, places: Array) -> float | None:
     """Seconds to add to the stamps of another clock; None if this clock does not run like that of the others.
 
     Args:
@@ -135,7 +133,7 @@ def clock_offset(time: Column, place: Column, others: Column, places: Column) ->
 
 
 def believed(
-    names: Sequence[str], times: Sequence[Column], places: Sequence[Column], *, absent: float | None = None
+    names: Sequence[str], times: Sequence[Array], places: Sequence[Array], *, absent: float | None = None
 ) -> tuple[list[Flags], list[float], list[Fault]]:
     """Bring all streams to one clock, that of most records.
 
@@ -223,7 +221,7 @@ def screened_parts(parts: Iterator[Recording]) -> Iterator[Recording]:
 
     The neighbours of a stamp include those in the parts before and after.
     """
-    before: dict[str, Column] = {}
+    before: dict[str, Array] = {}
     faults: dict[str, Fault] = {}
     totals: dict[str, int] = {}
     names: list[str] = []
@@ -277,7 +275,7 @@ def _streams(recording: Recording) -> Iterator[tuple[str, SignalArray]]:
             yield array.stream or name, array
 
 
-def _kept(recording: Recording, before: Mapping[str, Column], after: Recording | None) -> dict[int, NDArray[np.int64]]:
+def _kept(recording: Recording, before: Mapping[str, Array], after: Recording | None) -> dict[int, NDArray[np.int64]]:
     """Rows to keep, by the id of the array of stamps; only for streams that lose rows."""
     later = {s: a.time[:_NEIGHBOURS] for s, a in _streams(after)} if after is not None else {}
     streams = list(_streams(recording))

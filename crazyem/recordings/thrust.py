@@ -8,16 +8,13 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crazyem.physics import folding
 from crazyem.physics.rotors import wrench_from_command, wrench_from_speed
 from crazyem.recordings.airborne import Airtime
-from crazyem.recordings.ordering import held, sound_samples
+from crazyem.recordings.ordering import Array, held, sound_samples
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import GRAVITY, Vehicle, load_vehicle, preset_names
-
-Array = NDArray[np.float64]
 
 # s; longest interval between samples of a command or rotor speed. Rotors lag by 30 to 70 ms, so their thrust between
 # samples further apart is unknown.

@@ -17,12 +17,11 @@ from crazyem.recordings.contents import GrowingArray, ReadOptions
 from crazyem.recordings.csv.text import BLOCK_BYTES, LONGEST_LINE, Damage, text_blocks
 from crazyem.recordings.export import HOST_TIME, METADATA_SUFFIX, TIME, from_json
 from crazyem.recordings.finding import Finding, Grade, note
+from crazyem.recordings.ordering import Array
 from crazyem.recordings.recording import Recording, SignalArray, about
 from crazyem.signals.sample import SIGNALS, components
 
 _LARGEST_DESCRIPTION = 256 << 20  # bytes
-
-Floats = NDArray[np.float64]
 
 
 def recognises(head: bytes) -> bool:
@@ -104,7 +103,7 @@ class _Held:
     def signals(self) -> dict[str, SignalArray]:
         """The signals; those of one stream share their stamps."""
         signals: dict[str, SignalArray] = {}
-        shared: list[tuple[NDArray[np.int64], int, Floats, Floats]] = []
+        shared: list[tuple[NDArray[np.int64], int, Array, Array]] = []
         for place, entry in enumerate(self.entries):
             order = self.order[place].rows
             # same rows: the orders differ only by the places of the signals

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
 from crazyem.recordings.contents import GrowingArray, ReadOptions
@@ -16,10 +15,10 @@ from crazyem.recordings.csv.mapping import CsvMapping, known_mappings, mapping_f
 from crazyem.recordings.csv.signals import CONTEXT_ROWS, Layout, Rows, signals_of
 from crazyem.recordings.csv.text import Columns, Damage, Header, parse_header_line, read_columns, read_header
 from crazyem.recordings.finding import Finding, Grade, note
+from crazyem.recordings.ordering import Array
 from crazyem.recordings.recording import Recording
 from crazyem.signals.sample import SIGNALS
 
-Array = NDArray[np.float64]
 _MOST_ROWS = 500_000  # in a part, at any stamps
 
 

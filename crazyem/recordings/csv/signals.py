@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from crazyem.physics.rotations import quaternion_from_euler, quaternion_product, rotate
 from crazyem.recordings.csv.mapping import SignalColumns
 from crazyem.recordings.finding import Finding, Grade, intervals_of, runs_of
+from crazyem.recordings.ordering import Array
 from crazyem.recordings.recording import SignalArray
 from crazyem.signals.sample import SIGNALS
 
@@ -19,7 +20,7 @@ ABSOLUTE_TOLERANCE = 4e-9  # files have nine decimals, rounded
 _CHUNK_ROWS = 1 << 16  # rows processed together, to bound memory
 
 
-def interpolated_rows(time: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.bool_]:
+def interpolated_rows(time: Array, values: Array) -> NDArray[np.bool_]:
     """Rows in runs of three or more samples on one straight line in every component.
 
     A packet carries all components, so a lost packet affects all of them at once. Constant components are no evidence
@@ -41,7 +42,7 @@ def interpolated_rows(time: NDArray[np.float64], values: NDArray[np.float64]) ->
     return rows
 
 
-def _centres(time: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _centres(time: Array, values: Array) -> NDArray[np.bool_]:
     """(n - 2,) whether each inner row lies on the line through its neighbours, and the values change."""
     span = time[2:] - time[:-2]
     share = np.where(span > 0, (time[1:-1] - time[:-2]) / np.where(span > 0, span, 1.0), np.nan)
@@ -64,13 +65,11 @@ class Corners:
     """The samples of a slow stream that was linearly interpolated at faster rows."""
 
     row: NDArray[np.int64]  # (m,) the last row at or before each sample, increasing
-    time: NDArray[np.float64]  # (m,) s
-    value: NDArray[np.float64]  # (m,)
+    time: Array  # (m,) s
+    value: Array  # (m,)
 
 
-def corners(
-    time: NDArray[np.float64], value: NDArray[np.float64], *, starts: bool = True, ends: bool = True
-) -> Corners:
+def corners(time: Array, value: Array, *, starts: bool = True, ends: bool = True) -> Corners:
     """Recover the samples of a linear interpolation: its corners, between two rows or on a row.
 
     The corner between rows k and k+1 is the intersection of the line through k-1 and k with the line through k+1 and
@@ -116,9 +115,7 @@ def corners(
     return Corners(row[place], stamp[place], level[place])
 
 
-def _meeting(
-    time: NDArray[np.float64], value: NDArray[np.float64], k: NDArray[np.int64]
-) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+def _meeting(time: Array, value: Array, k: NDArray[np.int64]) -> tuple[NDArray[np.bool_], Array]:
     """Whether the lines before row k and after row k+1 meet between these rows, and (time, value) of the point."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         left = (value[k] - value[k - 1]) / (time[k] - time[k - 1])
@@ -130,7 +127,6 @@ def _meeting(
         return met, np.stack([time[k] + share * step, value[k] + left * share * step], axis=1)
 
 
-Array = NDArray[np.float64]
 _HARMLESS_SHARE = 0.05  # of rows drawn across lost packets
 _SQRT_HALF = math.sqrt(0.5)
 _NED_TO_ENU = (_SQRT_HALF, _SQRT_HALF, 0.0, 0.0)  # x y z w: half a turn about the bisector of north and east

@@ -42,9 +42,8 @@ def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Itera
     """
     in_parts = seconds < math.inf
     reading = _Reading(path, options, in_parts=in_parts)
-    if (
-        in_parts and not reading.announced
-    ):  # cut off, so without a summary: the channels are known only after a pass over the file
+    if in_parts and not reading.announced:
+        # cut off, so without a summary: the channels are known only after a pass over the file
         for part in parts(path, []):
             reading.announced.extend(part.announced)
     reading.content.announce(reading.announced)
