@@ -80,20 +80,17 @@ def _again(recording: Recording, finding: Finding) -> Finding | None:
     check = _check_of(finding)
     if check is None:
         return finding
-    return next((f for f in check.run(recording) if _same(f, finding)), None)
+    return next((f for f in check.run(recording) if _wish(f) == _wish(finding)), None)
+
+
+def _wish(finding: Finding) -> object:
+    """Equal for findings that ask for a repair of one kind of the same signals."""
+    fix = finding.fix
+    return finding.check, finding.signal, fix and (fix.kind, frozenset(fix.signals))
 
 
 def _check_of(finding: Finding) -> Check | None:
     return next((check for check in CHECKS if check.module == finding.check), None)
-
-
-def _same(one: Finding, other: Finding) -> bool:
-    """Whether two findings ask for a repair of one kind of the same signals."""
-    a, b = one.fix, other.fix
-    if a is None or b is None:
-        return False
-    alike = (one.check, one.signal, a.kind) == (other.check, other.signal, b.kind)
-    return alike and set(a.signals) == set(b.signals)
 
 
 def _possible(recording: Recording, fix: Fix | None) -> bool:

@@ -29,7 +29,11 @@ def check(recording: Recording) -> list[Finding]:
     first = next(iter(positions), "")
     for name, array in positions.items():
         if name not in (first, *blamed) and first not in blamed:
-            seen = _compare_positions(array, first, positions[first])
+            # positions, not their derivatives: late packets distort the scale of a derivative
+            grid = grid_of(array, positions[first])
+            candidates = {"world": (0, track(positions[first], grid))}
+            width = max(VELOCITY_WINDOW, width_for(array, positions[first]))
+            seen = hypotheses.compare_hypotheses(array, grid, first, candidates, width=width, least=LEAST_POSITION_RMS)
             if seen is not None:
                 found += _judge_position(name, seen, blamed)
     return found
@@ -49,14 +53,6 @@ def _compare(
     return hypotheses.compare_hypotheses(
         array, grid, other, candidates, width=width, least=LEAST_VELOCITY_RMS, offset=False
     )
-
-
-def _compare_positions(array: SignalArray, other: str, reference: SignalArray) -> hypotheses.Comparison | None:
-    """Comparison of positions, not of their derivatives: late packets distort the scale of a derivative."""
-    grid = grid_of(array, reference)
-    candidates = {"world": (0, track(reference, grid))}
-    width = max(VELOCITY_WINDOW, width_for(array, reference))
-    return hypotheses.compare_hypotheses(array, grid, other, candidates, width=width, least=LEAST_POSITION_RMS)
 
 
 def _judge(name: str, looks: list[hypotheses.Comparison], blamed: set[str]) -> list[Finding]:

@@ -220,19 +220,14 @@ def _schema(description: Description) -> Any:
 
 def _about(column: Column) -> dict[str, str]:
     """The known properties of a column, by name."""
-    entry = column.entry
+    entry, part = column.entry, column.component
+    one = part is not None and len(entry.source) == len(entry.components)
+    source = entry.source[part or 0] if one else ", ".join(entry.source)
     about = {"signal": entry.name, "quantity": entry.quantity, "unit": column.unit, "frame": entry.frame}
-    about |= {"clock": entry.clock, "stream": entry.stream, "source": _source(column)}
+    about |= {"clock": entry.clock, "stream": entry.stream, "source": source}
     if column.component is None:
         about["description"] = "true where the sample was not measured, or the sensor said that it has none"
     return {k: v for k, v in about.items() if v}
-
-
-def _source(column: Column) -> str:
-    source = column.entry.source
-    if len(source) == len(column.entry.components) and column.component is not None:
-        return source[column.component]
-    return ", ".join(source)
 
 
 def attributes(description: Description) -> dict[str, Any]:

@@ -38,9 +38,7 @@ class Reader:
         return self.has(function) and bool(getattr(self._module(), function)(source))
 
     def read(self, path: Path, options: ReadOptions) -> Recording:
-        recording = self._module().read(path, options)
-        assert isinstance(recording, Recording)
-        return cut(screened(recording), options.start, options.end)
+        return cut(screened(self._module().read(path, options)), options.start, options.end)
 
     def read_parts(self, path: Path, options: ReadOptions, seconds: float) -> Iterator[Recording]:
         """As `read`, in parts; only for a reader whose module has `read_parts`."""

@@ -21,7 +21,6 @@ from crazyem.recordings.autopilots.frd_ned import (
     BODY,
     MOTORS,
     WORLD,
-    Columns,
     angles_of_quaternions,
     euler,
     quaternions,
@@ -168,10 +167,6 @@ def _other_frame(topic: Topic) -> NDArray[np.bool_]:
     return np.ones(topic.time.size, bool) if frame is None else frame != 1
 
 
-def _not(columns: Columns) -> NDArray[np.float64]:
-    return (stacked(columns) == 0).astype(float)
-
-
 def _odometry(topic: str, origin: str) -> tuple[Source, Source]:
     """Pose from an external source, in rows that are in NED."""
     place, turn = named("position[*]", _THREE), named("q[*]", _FOUR)
@@ -201,7 +196,13 @@ _ULOG_SIGNALS: tuple[Source, ...] = (
     Source("voltage", "battery_status", ("voltage_v",), stacked, zero_is_absent=True),
     Source("setpoint_position", _TARGET, _XYZ, vectors, absent_is_nan=True, frame=WORLD),
     Source("setpoint_velocity", _TARGET, named("*", "vx vy vz"), vectors, absent_is_nan=True, frame=WORLD),
-    Source("flying", "vehicle_land_detected", ("landed",), _not, frame="1 while the autopilot does not say landed"),
+    Source(
+        "flying",
+        "vehicle_land_detected",
+        ("landed",),
+        lambda c: 1.0 - (stacked(c) != 0),
+        frame="1 while the autopilot does not say landed",
+    ),
     Source("acceleration", _LOCAL, named("*", "ax ay az"), vectors, _valid("v_xy_valid", "v_z_valid"), frame=WORLD),
     Source("motor_request", "actuator_motors", named("control[*]", _FOUR), stacked, absent_is_nan=True, frame=MOTORS),
     Source(

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.atomic_file import new_file
+from crazyem.recordings.columns import entry_of
 from crazyem.recordings.finding import Grade
 from crazyem.recordings.mcap import schemas
 from crazyem.recordings.mcap.output import Output
@@ -73,19 +74,17 @@ class _Group:
 
     stream: str
     base: NDArray[np.int64]  # (n,) places of the samples of the first signal in the processing order
-    names: list[str] = field(default_factory=list)
-    indices: list[int] = field(default_factory=list)  # places of the signals in the recording
-    arrays: list[SignalArray] = field(default_factory=list)
+    members: list[tuple[str, int, SignalArray]] = field(default_factory=list)  # name, place in the recording, array
 
     def takes(self, array: SignalArray, rank: NDArray[np.int64]) -> bool:
         """Whether `array` fits into the same messages, after the present arrays."""
-        width = sum(a.value.shape[1] for a in (*self.arrays, array))
-        if len(self.arrays) >= MOST_SIGNALS or width > MOST_FIELDS:
+        width = array.value.shape[1] + sum(a.value.shape[1] for *_, a in self.members)
+        if len(self.members) >= MOST_SIGNALS or width > MOST_FIELDS:
             return False
-        mine = self.arrays[0]
+        mine = self.members[0][2]
         return (
             array.time.size == mine.time.size
-            and np.array_equal(rank, self.base + len(self.arrays))
+            and np.array_equal(rank, self.base + len(self.members))
             and _same_bits(array.time, mine.time)
             and _same_bits(array.host_time, mine.host_time)
         )
@@ -108,9 +107,7 @@ def _groups(signals: Mapping[str, SignalArray], places: Mapping[str, NDArray[np.
         if newest is None or not newest.takes(array, places[name]):
             newest = _Group(array.stream, places[name])
             groups.append(newest)
-        newest.names.append(name)
-        newest.indices.append(index[name])
-        newest.arrays.append(array)
+        newest.members.append((name, index[name], array))
     return groups
 
 
@@ -122,14 +119,14 @@ class _Stream:
         # rows in processing order; if the arrays have another order, each message contains its row
         self.rows = np.argsort(group.base, kind="stable")
         shuffled = not np.array_equal(self.rows, np.arange(self.rows.size))
-        self.arrays = group.arrays
+        self.arrays = [array for *_, array in group.members]
         self.keys = group.base[self.rows].astype(float)
         self.layout = StreamLayout(
             identifier=unique_name(group.stream or "table", taken),
             stream=group.stream,
             signals=tuple(
-                Column(n, i, _components(a), a.quantity, a.unit, a.frame, a.clock, a.source)
-                for n, i, a in zip(group.names, group.indices, group.arrays, strict=True)
+                Column(n, i, entry_of(n, a).components, a.quantity, a.unit, a.frame, a.clock, a.source)
+                for n, i, a in group.members
             ),
             rows=shuffled,
         )
@@ -148,12 +145,6 @@ class _Stream:
             columns += [rows] if self.layout.rows else []
             columns += [column for array in self.arrays for column in array.value[rows].T]
             yield from map(bytes, self.layout.messages.encode(columns))
-
-
-def _components(array: SignalArray) -> tuple[str, ...]:
-    width = array.value.shape[1]
-    names = array.components
-    return names if len(names) == width else ("",) if width == 1 else tuple(str(i) for i in range(width))
 
 
 # --- times and order in the file --------------------------------------------------------------------------------------
