@@ -47,12 +47,6 @@ class Book:
         known: dict[int, Any] = self.channels if isinstance(record, records.Channel) else self.schemas
         known.setdefault(record.id, record)
 
-    def count(self, channel: int, messages: int, start: int, end: int) -> None:
-        """Add `messages` of a channel with log times from `start` to `end` [ns]."""
-        self.counts[channel] = self.counts.get(channel, 0) + messages
-        self.start = start if self.start is None else min(self.start, start)
-        self.end = end if self.end is None else max(self.end, end)
-
 
 class Output:
     """An MCAP file being written.
@@ -234,7 +228,9 @@ def note_chunk(
         )
     )
     for channel, pairs in index.items():
-        book.count(channel, len(pairs), int(pairs[:, 0].min()), int(pairs[:, 0].max()))
+        book.counts[channel] = book.counts.get(channel, 0) + len(pairs)
+    if index:
+        book.start, book.end = min(start, start if book.start is None else book.start), max(end, book.end or 0)
 
 
 def index_record(channel: int, pairs: NDArray[np.uint64]) -> bytes:
