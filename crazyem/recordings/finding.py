@@ -50,28 +50,19 @@ class Fix:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finding:
-    """One problem or remarkable property of a recording.
+    """One problem or remarkable property of a recording."""
 
-    Attributes:
-        check: which check found it, e.g. "gaps"; readers use "integrity", "interpolated", "mapping", "motor_meaning",
-            "stamps".
-        grade: how much it matters.
-        text: one sentence for people.
-        signal: name of the signal concerned; "" for the whole recording.
-        intervals: (start, end) in s on the recording's time axis, in order; () for the whole recording.
-        evidence: numbers that support the finding, by a name that has the unit ("longest_s", "slope", "share").
-        advice: what to do, one sentence.
-        fix: a lossless repair, None if there is none.
-    """
-
+    # which check found it, e.g. "gaps"; readers use "integrity", "interpolated", "mapping", "motor_meaning", "stamps".
     check: str
-    grade: Grade
-    text: str
-    signal: str = ""
+    grade: Grade  # how much it matters
+    text: str  # one sentence for people
+    signal: str = ""  # name of the signal concerned; "" for the whole recording
+    # (start, end) in s on the recording's time axis, in order; () for the whole recording
     intervals: tuple[tuple[float, float], ...] = ()
+    # numbers that support the finding, by a name that has the unit ("longest_s", "slope", "share")
     evidence: Mapping[str, float] = field(default_factory=dict)
-    advice: str = ""
-    fix: Fix | None = None
+    advice: str = ""  # what to do, one sentence
+    fix: Fix | None = None  # a lossless repair, None if there is none
 
     def to_dict(self, rows: Callable[[NDArray[np.int64]], object] = np.size) -> dict[str, Any]:
         """For JSON; `rows` as for `Fix.to_dict`."""

@@ -81,17 +81,11 @@ def about(signal: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """An event in the flight: a setpoint, a write of a parameter, an estimate or a log message.
+    """An event in the flight: a setpoint, a write of a parameter, an estimate or a log message."""
 
-    Attributes:
-        time: s since the epoch (host clock).
-        kind: "setpoint", "parameter_write", "estimate" or "log".
-        data: its fields by name.
-    """
-
-    time: float
-    kind: str
-    data: Mapping[str, object]
+    time: float  # s since the epoch (host clock)
+    kind: str  # "setpoint", "parameter_write", "estimate" or "log"
+    data: Mapping[str, object]  # its fields by name
 
 
 @dataclass(frozen=True, slots=True, eq=False)
