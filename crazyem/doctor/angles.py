@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor import kinematics
-from crazyem.doctor.delays import delay
 from crazyem.doctor.hypotheses import sign_factor, signed
 from crazyem.doctor.regression import Choice, blocks, choose, slope
 from crazyem.physics.rotations import euler_from_quaternion, rotate
@@ -95,7 +94,7 @@ def _by_rate(array: SignalArray, recording: Recording) -> tuple[str, dict[str, f
         }
         raw = kinematics.track(gyro, grid)
         # a conjugate turns the other way about nearly the same axes: one reading of each order suffices for the lag
-        lags = [delay(one, window.mean(raw)) for one in list(smooth.values())[:2]]
+        lags = [kinematics.delay(one, window.mean(raw)) for one in list(smooth.values())[:2]]
         good = [one for one in lags if one is not None and not one.at_edge]
         if not good:
             continue
@@ -146,7 +145,7 @@ def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -
     window = kinematics.Window(max(0.1, kinematics.width_for(array, quaternion) / 2))
     truth = kinematics.track(_unwrapped(quaternion), grid)
     straight = _continuous_angles(array)
-    late = delay(window.mean(truth), window.mean(kinematics.track(straight, grid)), reach=0.15)
+    late = kinematics.delay(window.mean(truth), window.mean(kinematics.track(straight, grid)), reach=0.15)
     lag = late.value if late is not None and not late.at_edge and late.explained > 0.5 else 0.0
     x, y = window.mean(truth), window.mean(kinematics.track(straight, grid, shift=lag))
     rows = np.flatnonzero(_upright(kinematics.track(quaternion, grid), x.valid & y.valid))[::3]

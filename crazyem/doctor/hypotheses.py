@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.delays import delay
-from crazyem.doctor.kinematics import Grid, Track, Window, track
+from crazyem.doctor.kinematics import Grid, Track, Window, delay, track
 from crazyem.doctor.regression import Choice, Slope, blocks, choose, slope
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.ordering import Array

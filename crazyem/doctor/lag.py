@@ -12,7 +12,6 @@ import numpy as np
 from scipy import stats
 
 from crazyem.doctor import kinematics
-from crazyem.doctor.delays import LARGEST_LAG, delay, spread
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.ordering import Array
 from crazyem.recordings.recording import Recording, SignalArray
@@ -124,18 +123,20 @@ def _fit(name: str, array: SignalArray, against: str, other: SignalArray) -> _La
         return None
     window = kinematics.Window(max(0.3 if other.quantity == "attitude" else 0.2, kinematics.width_for(array, other)))
     first, second, width = window.mean(_speed(other, grid)), window.mean(_speed(array, grid)), window.width
-    whole = delay(first, second, mixed=False)
+    whole = kinematics.delay(first, second, mixed=False)
     if whole is None or whole.at_edge or whole.explained < LEAST_WINDOW_SHARE:
         return None
     size = round(max(WINDOW_SECONDS, grid.size * kinematics.GRID_STEP / MOST_WINDOWS) / kinematics.GRID_STEP)
-    error, count = spread(first, second, whole, size // 2)
+    error, count = kinematics.spread(first, second, whole, size // 2)
     error = max(error, _error(first, second, whole.value, whole.explained, width))
     if count < FEWEST_WINDOWS or not error < math.inf:
         return None
     found = []
     for first_row in range(0, grid.size - size // 2, size):
         rows = slice(first_row, first_row + size)
-        one = delay(first.part(rows), second.part(rows), reach=min(LARGEST_LAG, abs(whole.value) + 0.15), mixed=False)
+        one = kinematics.delay(
+            first.part(rows), second.part(rows), reach=min(kinematics.LARGEST_LAG, abs(whole.value) + 0.15), mixed=False
+        )
         if one is None or one.at_edge or one.explained < LEAST_WINDOW_SHARE:
             continue
         rough = _error(first.part(rows), second.part(rows), one.value, one.explained, width)

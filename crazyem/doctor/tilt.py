@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.doctor.delays import delay
 from crazyem.doctor.kinematics import (
     GRAVITY,
     UP,
     Grid,
     Track,
     Window,
+    delay,
     difference,
     grid_of,
     measurements,

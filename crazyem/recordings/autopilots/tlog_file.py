@@ -1,7 +1,7 @@
 """Read MAVLink telemetry logs (tlog): each message at its own rate, converted from FRD and NED to FLU and NWU.
 
 A ground station writes a tlog with the time of arrival of each message; some messages also have the time since boot of
-the autopilot, which is the time axis (`tlog_clock`). The table in `tlog_signals` maps messages to signals;
+the autopilot, which is the time axis (`tlog_frames.Clocks`). The table `TLOG_SIGNALS` maps messages to signals;
 docs/reference/formats/tlog.md explains the table.
 """
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
 from crazyem.physics.rotations import quaternion_from_euler
+from crazyem.recordings.autopilots import tlog_frames
 from crazyem.recordings.autopilots.frd_ned import (
     ATTITUDE,
     BODY,
@@ -29,8 +30,6 @@ from crazyem.recordings.autopilots.frd_ned import (
     vectors,
     vehicle_of,
 )
-from crazyem.recordings.autopilots.tlog_clock import Clocks, link
-from crazyem.recordings.autopilots.tlog_frames import MESSAGES, Frames, Frameset, columns_of, scan, units_of
 from crazyem.recordings.contents import ReadOptions, contents
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import Event, Recording
@@ -146,7 +145,7 @@ _NO_SIGNALS = {"PARAM_VALUE", "STATUSTEXT", "FILE_TRANSFER_PROTOCOL", "LOG_DATA"
 
 def recognises(head: bytes) -> bool:
     """True if frames with sound checksums follow each other near the start."""
-    found = scan(head[: 4 * _SKIPPED_HEAD], at_most=_SOUND_FRAMES + 1)
+    found = tlog_frames.scan(head[: 4 * _SKIPPED_HEAD], at_most=_SOUND_FRAMES + 1)
     known = sum(len(f.stamps) for f in found.frames.values())
     return known >= _SOUND_FRAMES and sum(c for o, c in found.skipped if o == 0) <= _SKIPPED_HEAD
 
@@ -154,13 +153,13 @@ def recognises(head: bytes) -> bool:
 def read(path: Path, options: ReadOptions) -> Recording:
     """Read a telemetry log. Raises FileFormatError naming the file and the reason."""
     data = contents(path)
-    found = scan(data)
+    found = tlog_frames.scan(data)
     size = len(data)
     del data
     if not found.frames:
         raise FileFormatError(f"{path}: not one of the log's frames has a sound checksum.")
     system, others = _vehicle(found)
-    clocks = Clocks(found, system)
+    clocks = tlog_frames.Clocks(found, system)
     topics = _topics(found, system, clocks)
     topics = [t for t in topics if t.time.size]
     if not topics:
@@ -169,7 +168,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
     sources = (*TLOG_SIGNALS, *(RAW_IMU if autopilot == _ARDUPILOT else ()))
     signals, left_out = signals_of(topics, [m for source in sources for m in source.of(topics)])
     absent, unplugged = unconnected(topics, sources, signals)
-    losses = link(found, system, clocks.component, clocks.starts)
+    losses = tlog_frames.link(found, system, clocks.component, clocks.starts)
     findings = [*damage(found.skipped, size, "MAVLink frame"), *losses.findings(clocks.arrival), *others]
     findings += [*finding(clocks.faults, signals), *clocks.findings(), *left_out, *unplugged]
     findings += _notes(signals, found, autopilot == _ARDUPILOT)
@@ -191,18 +190,18 @@ def read(path: Path, options: ReadOptions) -> Recording:
     )
 
 
-def _beat(found: Frameset, system: int) -> tuple[int, int]:
+def _beat(found: tlog_frames.Frameset, system: int) -> tuple[int, int]:
     """MAV_TYPE and MAV_AUTOPILOT of a system by its heartbeats; (-1, -1) if it is not a vehicle."""
     for (sender, _, message), frames in sorted(found.frames.items()):
         if sender == system and message == 0:
-            columns = columns_of(MESSAGES[0], frames.payloads[:1])
+            columns = tlog_frames.columns_of(tlog_frames.MESSAGES[0], frames.payloads[:1])
             kind, autopilot = int(columns["type"][0]), int(columns["autopilot"][0])
             if autopilot != _INVALID_AUTOPILOT and kind not in _NOT_A_VEHICLE:
                 return kind, autopilot
     return -1, -1
 
 
-def _vehicle(found: Frameset) -> tuple[int, list[Finding]]:
+def _vehicle(found: tlog_frames.Frameset) -> tuple[int, list[Finding]]:
     """The system to read: the vehicle (by heartbeats) with most messages, else the system with most; and findings."""
     counts: Counter[int] = Counter()
     for (system, _, _), frames in found.frames.items():
@@ -220,14 +219,14 @@ def _vehicle(found: Frameset) -> tuple[int, list[Finding]]:
     return chosen, [Finding("mapping", Grade.DEGRADES, text, evidence={"vehicles": len(vehicles)}, advice=advice)]
 
 
-def _topics(found: Frameset, system: int, clocks: Clocks) -> list[Topic]:
+def _topics(found: tlog_frames.Frameset, system: int, clocks: tlog_frames.Clocks) -> list[Topic]:
     """One topic per message, instance and component; suffix and prefix as in "BATTERY_STATUS_1", "158/ATTITUDE"."""
     topics = []
     for (sender, component, identifier), frames in sorted(found.frames.items(), key=lambda kv: kv[1].places[0]):
-        message = MESSAGES[identifier]
+        message = tlog_frames.MESSAGES[identifier]
         if sender != system or message.msgname in _NO_SIGNALS:
             continue
-        columns = columns_of(message, frames.payloads)
+        columns = tlog_frames.columns_of(message, frames.payloads)
         prefix = "" if component == clocks.component else f"{component}/"
         time, clock = clocks.place(component, frames, message, prefix + message.msgname)
         host = seconds(np.array(frames.stamps, np.int64))
@@ -236,7 +235,7 @@ def _topics(found: Frameset, system: int, clocks: Clocks) -> list[Topic]:
         for suffix, rows in _instances(message.msgname, columns):
             numbers = {c: v[rows] for c, v in columns.items() if v.dtype.kind != "S" and c != used}
             name = prefix + message.msgname + suffix
-            units = units_of(message, numbers)
+            units = tlog_frames.units_of(message, numbers)
             topics.append(Topic(name, numbers, time[rows], order[rows], host[rows], clock, units))
     return topics
 
@@ -251,7 +250,7 @@ def _instances(name: str, columns: Mapping[str, NDArray[np.generic]]) -> list[tu
     return [(f"_{text_of(value)}" if i or text else "", np.flatnonzero(key == value)) for i, value in enumerate(values)]
 
 
-def _notes(signals: Mapping[str, object], found: Frameset, ardupilot: bool) -> list[Finding]:
+def _notes(signals: Mapping[str, object], found: tlog_frames.Frameset, ardupilot: bool) -> list[Finding]:
     notes = []
     if any(name.startswith("SERVO_OUTPUT_RAW.") for name in signals):
         text = (
@@ -267,7 +266,7 @@ def _notes(signals: Mapping[str, object], found: Frameset, ardupilot: bool) -> l
     return notes
 
 
-def _about(found: Frameset, system: int, clocks: Clocks) -> dict[str, str]:
+def _about(found: tlog_frames.Frameset, system: int, clocks: tlog_frames.Clocks) -> dict[str, str]:
     kind, autopilot = _beat(found, system)
     senders = sorted({(s, c) for s, c, _ in found.frames})
     return {
@@ -281,14 +280,16 @@ def _about(found: Frameset, system: int, clocks: Clocks) -> dict[str, str]:
     }
 
 
-def _messages(found: Frameset, system: int, name: str) -> Iterator[tuple[Frames, dict[str, NDArray[np.generic]]]]:
+def _messages(
+    found: tlog_frames.Frameset, system: int, name: str
+) -> Iterator[tuple[tlog_frames.Frames, dict[str, NDArray[np.generic]]]]:
     """The frames of one message of a system, and their columns, for each component."""
     for (sender, _, identifier), frames in found.frames.items():
-        if sender == system and MESSAGES[identifier].msgname == name:
-            yield frames, columns_of(MESSAGES[identifier], frames.payloads)
+        if sender == system and tlog_frames.MESSAGES[identifier].msgname == name:
+            yield frames, tlog_frames.columns_of(tlog_frames.MESSAGES[identifier], frames.payloads)
 
 
-def _parameters(found: Frameset, system: int) -> dict[str, str]:
+def _parameters(found: tlog_frames.Frameset, system: int) -> dict[str, str]:
     """The last value of each parameter that the vehicle reported."""
     values: dict[str, str] = {}
     for _, columns in _messages(found, system, "PARAM_VALUE"):
@@ -297,7 +298,7 @@ def _parameters(found: Frameset, system: int) -> dict[str, str]:
     return dict(list(values.items())[:5000])
 
 
-def _events(found: Frameset, system: int) -> tuple[Event, ...]:
+def _events(found: tlog_frames.Frameset, system: int) -> tuple[Event, ...]:
     """Text messages of the vehicle."""
     events = []
     for frames, columns in _messages(found, system, "STATUSTEXT"):
