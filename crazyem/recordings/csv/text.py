@@ -5,10 +5,8 @@ parses the block again line by line. So each error has a line and a column, and 
 """
 
 import csv
-import gzip
 import io
 import math
-import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,8 +17,9 @@ import pyarrow as pa
 import pyarrow.csv
 from numpy.typing import NDArray
 
-from crazyem.errors import FileFormatError, UsageError
+from crazyem.errors import FileFormatError
 from crazyem.recordings.columns import unique_name
+from crazyem.recordings.contents import opened
 from crazyem.recordings.finding import Finding, Grade, note
 
 BLOCK_BYTES = 4 << 20
@@ -180,34 +179,25 @@ def text_blocks(path: Path, damage: Damage, size: int = BLOCK_BYTES) -> Iterator
         UsageError if the file cannot be read.
     """
     rest = b""
-    try:
-        with path.open("rb") as raw:
-            packed = raw.read(2) == b"\x1f\x8b"
-            raw.seek(0)
-            source: IO[bytes] = gzip.GzipFile(fileobj=raw) if packed else raw  # type: ignore[assignment]
-            total = 0
-            while True:
-                chunk, ended = _chunk(source, size, packed)
-                damage.cut_gzip |= ended
-                total += len(chunk)
-                if packed and total > _SMALL_TEXT and total > LARGEST_RATIO * raw.tell():
-                    raise FileFormatError(
-                        f"{path}: the gzip file unpacks to more than {LARGEST_RATIO} times its size; it is not read."
-                    )
-                if not chunk:
-                    break
-                block, newline, rest_of_it = (rest + chunk).rpartition(b"\n")
-                rest = rest_of_it
-                if len(rest) > LONGEST_LINE:
-                    raise FileFormatError(f"{path}: there is a line of more than {LONGEST_LINE} bytes.")
-                if newline:
-                    yield block + newline
-                if ended:
-                    break
-    except (gzip.BadGzipFile, zlib.error) as error:
-        raise FileFormatError(f"{path} is not a readable gzip file ({error}).") from error
-    except OSError as error:
-        raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
+    total = 0
+    with opened(path) as (raw, source, packed):
+        while True:
+            chunk, ended = _chunk(source, size, packed)
+            damage.cut_gzip |= ended
+            total += len(chunk)
+            if packed and total > _SMALL_TEXT and total > LARGEST_RATIO * raw.tell():
+                raise FileFormatError(
+                    f"{path}: the gzip file unpacks to more than {LARGEST_RATIO} times its size; it is not read."
+                )
+            if not chunk:
+                break
+            block, newline, rest = (rest + chunk).rpartition(b"\n")
+            if len(rest) > LONGEST_LINE:
+                raise FileFormatError(f"{path}: there is a line of more than {LONGEST_LINE} bytes.")
+            if newline:
+                yield block + newline
+            if ended:
+                break
     damage.cut_line = bool(rest.strip())
 
 
