@@ -252,9 +252,11 @@ def stretches(survey: Survey, seconds: float, largest: float = STRETCH_BYTES) ->
             begin = begin if held else float(time[at])
             late = np.flatnonzero(time[at:] - begin >= seconds)
             end = at + int(late[0]) + 1 if late.size else time.size
-            held.append(_cut((time, records.kind, packed), order, at, end))
+            spans = [slice(*np.searchsorted(rows_of_kind, (at, end))) for rows_of_kind in order]
+            mine = [p[span] for p, span in zip(packed, spans, strict=True)]
+            held.append((time[at:end], records.kind[at:end], mine))
             rows += end - at
-            held_bytes += sum(p.nbytes for p in held[-1][2])
+            held_bytes += sum(p.nbytes for p in mine)
             at = end
             ends = first + rows == total
             if late.size or held_bytes >= largest or ends:
@@ -262,13 +264,6 @@ def stretches(survey: Survey, seconds: float, largest: float = STRETCH_BYTES) ->
                 first, rows, held, held_bytes = first + rows, 0, [], 0
     if held:  # the file became shorter during reading
         yield _joined(header, held, first, True)
-
-
-def _cut(piece: _Piece, order: Sequence[NDArray[np.intp]], at: int, end: int) -> _Piece:
-    """A copy of the records `at` to `end` - 1 of a piece, so that the piece can be freed."""
-    time, kind, packed = piece
-    places = [np.searchsorted(rows, (at, end)) for rows in order]
-    return time[at:end], kind[at:end], [p[a:b].copy() for p, (a, b) in zip(packed, places, strict=True)]
 
 
 def _joined(header: usd_format.Header, held: list[_Piece], first: int, ends: bool) -> Stretch:
