@@ -52,25 +52,6 @@ class _Plan:
     as_published: bool
 
 
-class _Held:
-    """Rows that are read but not yet returned, one array per column (a single copy of the data)."""
-
-    def __init__(self) -> None:
-        self.arrays: dict[int, GrowingArray] = {}
-        self.rows = 0
-
-    def add(self, block: Columns) -> None:
-        """Append rows."""
-        more = _rows_in(block)
-        for c, values in block.items():
-            self.arrays.setdefault(c, GrowingArray(float)).more(more)[:] = values
-        self.rows += more
-
-    def joined(self) -> Columns:
-        """One array per column."""
-        return {c: array.rows for c, array in self.arrays.items()}
-
-
 def read(path: Path, options: ReadOptions) -> Recording:
     """Read a CSV flight. Raises FileFormatError naming the file and what is wrong with it."""
     return next(read_parts(path, options, math.inf))
@@ -120,34 +101,42 @@ def _joined(blocks: list[Array]) -> Array:
 
 def _parts(plan: _Plan, damage: Damage, seconds: float) -> Iterator[tuple[Columns, Columns, bool]]:
     """(rows of a part, some rows after it, whether the part ends the file)."""
-    held = _Held()
+    held: dict[int, GrowingArray] = {}
+    columns: Columns = {}
     number = 0
     blocks = read_columns(plan.path, plan.header, plan.needed, plan.wanted, damage, stamp=plan.stamp)
     # the rows held at the end may be several parts, because a part waits for its neighbours
     for block, neighbours in itertools.chain(zip(blocks, itertools.repeat(CONTEXT_ROWS)), [({}, 1)]):
-        held.add(block)
-        while (cut := _cut(plan, held, number, seconds, neighbours)) is not None:
-            columns = held.joined()
+        columns = _appended(held, block)
+        while (cut := _cut(plan, columns, number, seconds, neighbours)) is not None:
             rest = {c: v[cut:].copy() for c, v in columns.items()}
             number += cut
-            held = _Held()
-            held.add(rest)
             yield {c: v[:cut] for c, v in columns.items()}, {c: v[:CONTEXT_ROWS] for c, v in rest.items()}, False
-    if held.rows:
-        columns, held = held.joined(), _Held()
+            held = {}
+            columns = _appended(held, rest)
+    if columns:
+        held = {}
         yield {c: columns.pop(c) for c in list(columns)}, {}, True
     elif not number:
         raise FileFormatError(f"{plan.path}: there is a header but not a single sample.")
 
 
-def _cut(plan: _Plan, held: _Held, number: int, seconds: float, neighbours: int) -> int | None:
+def _appended(held: dict[int, GrowingArray], block: Columns) -> Columns:
+    """All rows, one array per column (a single copy of the data), after those of a block are appended to `held`."""
+    for c, values in block.items():
+        held.setdefault(c, GrowingArray(float)).more(values.size)[:] = values
+    return {c: array.rows for c, array in held.items() if array.size}
+
+
+def _cut(plan: _Plan, columns: Columns, number: int, seconds: float, neighbours: int) -> int | None:
     """Number of rows of the next part, None if it is not complete yet."""
-    if held.rows <= neighbours or seconds == math.inf:
+    count = _rows_in(columns)
+    if count <= neighbours or seconds == math.inf:
         return None
-    stamp = _stamps(plan, held.joined(), held.rows, number)
+    stamp = _stamps(plan, columns, count, number)
     late = stamp >= stamp[0] + seconds
-    cut = max(1, min(int(np.argmax(late)) if late.any() else held.rows + 1, _MOST_ROWS))
-    return cut if cut + neighbours <= held.rows else None
+    cut = max(1, min(int(np.argmax(late)) if late.any() else count + 1, _MOST_ROWS))
+    return cut if cut + neighbours <= count else None
 
 
 def _origin(plan: _Plan) -> float:
