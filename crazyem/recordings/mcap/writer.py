@@ -146,7 +146,9 @@ class RecordingWriter:
 
     def parameter_write(self, write: ParameterWrite) -> None:
         """Record a write of a parameter and its result."""
-        self._put(self._write_parameter, write)
+        fields = {"host_time": write.host_time, "name": write.name, "verified": write.verified}
+        fields |= {"value": float(write.value), "echoed": math.nan if write.echoed is None else float(write.echoed)}
+        self._put(self._write, *schemas.EVENT_TOPICS["parameter_write"], write.host_time, fields)
 
     def estimate(self, estimate: "Estimate") -> None:
         """Record an update of the estimator."""
@@ -164,11 +166,17 @@ class RecordingWriter:
             values: (12,) position [m], velocity [m/s], attitude [rad], body rate [rad/s]; NaN where not measured.
             sd: (12,) their expected standard deviations.
         """
-        self._put(self._write_residual, time, _now(), tuple(map(float, values)), tuple(map(float, sd)))
+        fields = {"time": float(time), "host_time": _now()}
+        for name, value, deviation in zip(schemas.RESIDUALS.split(), values, sd, strict=True):
+            fields |= {name: float(value), f"{name}_sd": float(deviation)}
+        self._put(self._write, *schemas.EVENT_TOPICS["residual"], fields["host_time"], fields)
 
     def event(self, text: str, level: str = "INFO") -> None:
         """Record a message such as a phase of the flight or a warning; `level` as in foxglove.Log."""
-        self._put(self._write_event, _now(), text, level)
+        now = _now()
+        stamp = schemas.timestamp(_nanoseconds(now))
+        fields = {"timestamp": stamp, "level": level, "message": text, "name": "crazyem"}
+        self._put(self._write, *schemas.EVENT_TOPICS["log"], now, fields)
 
     def close(self) -> None:
         """Write all data and finish the file; may be called twice."""
@@ -290,38 +298,17 @@ class RecordingWriter:
                 fields[f"{what}_{axis}"] = float(value)
         self._write(*schemas.EVENT_TOPICS["setpoint"], host_time, fields)
 
-    def _write_parameter(self, write: ParameterWrite) -> None:
-        fields = {
-            "host_time": write.host_time,
-            "name": write.name,
-            "value": float(write.value),
-            "echoed": math.nan if write.echoed is None else float(write.echoed),
-            "verified": write.verified,
-        }
-        self._write(*schemas.EVENT_TOPICS["parameter_write"], write.host_time, fields)
-
     def _write_estimate(self, host_time: float, estimate: "Estimate") -> None:
-        parameters = [
-            {
-                "name": name,
-                "value": float(p.value),
-                "sd": float(p.sd),
-                "ci95_low": float(p.ci95[0]),
-                "ci95_high": float(p.ci95[1]),
-                "unit": p.unit,
-                "identifiable": bool(p.identifiable),
-                "reason": p.reason,
-            }
-            for name, p in estimate.parameters.items()
-        ]
-        fields = {
-            "time": float(estimate.time),
-            "host_time": host_time,
-            "parameters": parameters,
-            "samples": int(estimate.samples),
-            "updates": int(estimate.updates),
-            "converged": bool(estimate.converged),
-        }
+        parameters = []
+        for name, p in estimate.parameters.items():
+            numbers = dict(
+                zip(("value", "sd", "ci95_low", "ci95_high"), map(float, (p.value, p.sd, *p.ci95)), strict=True)
+            )
+            about = {"name": name, "unit": p.unit, "identifiable": bool(p.identifiable), "reason": p.reason}
+            parameters.append(about | numbers)
+        fields = {"time": float(estimate.time), "host_time": host_time, "parameters": parameters}
+        fields |= {"samples": int(estimate.samples), "updates": int(estimate.updates)}
+        fields["converged"] = bool(estimate.converged)
         self._write(*schemas.EVENT_TOPICS["estimate"], host_time, fields)
 
     def _write_link(self, host_time: float, statistics: LinkStatistics, latency: float) -> None:
@@ -335,17 +322,6 @@ class RecordingWriter:
             fields["loss"] = lost / (received + lost) if received + lost > 0 else math.nan
         self._link_before = (host_time, statistics.received, statistics.lost)
         self._write(*schemas.EVENT_TOPICS["link"], host_time, fields)
-
-    def _write_residual(self, time: float, host_time: float, values: tuple[float, ...], sd: tuple[float, ...]) -> None:
-        fields = {"time": float(time), "host_time": host_time}
-        for name, value, deviation in zip(schemas.RESIDUALS.split(), values, sd, strict=True):
-            fields |= {name: value, f"{name}_sd": deviation}
-        self._write(*schemas.EVENT_TOPICS["residual"], host_time, fields)
-
-    def _write_event(self, host_time: float, text: str, level: str) -> None:
-        stamp = schemas.timestamp(_nanoseconds(host_time))
-        fields = {"timestamp": stamp, "level": level, "message": text, "name": "crazyem"}
-        self._write(*schemas.EVENT_TOPICS["log"], host_time, fields)
 
     def _write(self, topic: str, schema: str, host_time: float, fields: dict[str, Any]) -> None:
         self._message(self._channel(topic, schema), host_time, schemas.encode(schema, fields))
