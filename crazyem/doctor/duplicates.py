@@ -141,9 +141,8 @@ def _channels(recording: Recording) -> list[tuple[Array, Array]]:
 
 
 def _rank(name: str, array: SignalArray) -> tuple[int, str]:
-    quantity = array.quantity
-    place = _PREFERRED_SIGNALS.index(quantity) if quantity in _PREFERRED_SIGNALS else len(_PREFERRED_SIGNALS)
-    return 2 * place + ("@" in name), name
+    known = [*_PREFERRED_SIGNALS, array.quantity]
+    return 2 * known.index(array.quantity) + ("@" in name), name
 
 
 def _numbers(time: Array, value: Array) -> tuple[Hashes, Array]:

@@ -202,7 +202,12 @@ class Inventory:
             parts.append(f"  crazyem replay cannot use it: {self.no_replay}")
         if not everything:
             return "\n".join([*parts, *_summary_lines(self.signals)])
-        parts += ["", *_metadata_lines(self.metadata), *_signal_lines(self.signals), *_clock_lines(self.clocks)]
+        parts += [
+            "",
+            *(_metadata_line(*section) for section in self.metadata.items()),
+            *_signal_lines(self.signals),
+            *map(_clock_line, self.clocks),
+        ]
         if self.events:
             parts.append("events: " + ", ".join(f"{count} {kind}" for kind, count in self.events.items()))
         return "\n".join(parts)
@@ -293,14 +298,9 @@ def _short(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, str
     return kept
 
 
-def _metadata_lines(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
-    lines = []
-    for section, values in metadata.items():
-        text = f"{len(values)} entries (--json shows them)"
-        if len(values) <= _MOST_ENTRIES:
-            text = ", ".join(f"{key} {value}" for key, value in values.items())
-        lines.append(f"  {section}: {text}")
-    return lines
+def _metadata_line(section: str, values: Mapping[str, str]) -> str:
+    entries = ", ".join(f"{key} {value}" for key, value in values.items())
+    return f"  {section}: {entries if len(values) <= _MOST_ENTRIES else f'{len(values)} entries (--json shows them)'}"
 
 
 def _signal_lines(rows: tuple[SignalRow, ...]) -> list[str]:
@@ -325,12 +325,9 @@ def _names(source: tuple[str, ...]) -> str:
     return source[0] if len(source) == 1 else f"{source[0]} .. {source[-1]}" if source else ""
 
 
-def _clock_lines(rows: tuple[ClockRow, ...]) -> list[str]:
-    lines = []
-    for row in rows:
-        drift = "" if row.against_host_ppm is None else f", {row.against_host_ppm:+.0f} ppm against the host"
-        lines.append(f"clock {row.name or 'unnamed'}: {row.start_s:.3f} to {row.end_s:.3f} s{drift}")
-    return lines
+def _clock_line(row: ClockRow) -> str:
+    drift = "" if row.against_host_ppm is None else f", {row.against_host_ppm:+.0f} ppm against the host"
+    return f"clock {row.name or 'unnamed'}: {row.start_s:.3f} to {row.end_s:.3f} s{drift}"
 
 
 def _flight_lines(e: Envelope, on_the_ground: str) -> list[str]:

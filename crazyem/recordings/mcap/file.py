@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -242,39 +242,28 @@ class _Rows:
         return [array.take() for array in self._arrays], self._places.take()
 
 
-@dataclass
-class _BlockChannel:
-    block: Block
-    session: int
-    rows: _Rows
-
-    def table(self) -> Table:
-        (stamp, host_time, values), places = self.rows.take()
-        ctypes = {v.name: v.ctype for v in self.block.variables}
-        columns = {v.name: values[:, i] for i, v in enumerate(self.block.variables)}
-        name = f"log/{self.block.identifier}"
-        return Table(name, columns, stamp[:, 0] / 1000.0, places, host_time[:, 0], ctypes=ctypes)
+def _table(block: Block, rows: _Rows) -> Table:
+    """The packets of a log block, which are then dropped in `rows`."""
+    (stamp, host_time, values), places = rows.take()
+    ctypes = {v.name: v.ctype for v in block.variables}
+    columns = {v.name: values[:, i] for i, v in enumerate(block.variables)}
+    return Table(f"log/{block.identifier}", columns, stamp[:, 0] / 1000.0, places, host_time[:, 0], ctypes=ctypes)
 
 
-@dataclass
-class _StreamChannel:
-    layout: StreamLayout
-    rows: _Rows
-
-    def signals(self) -> list[tuple[int, str, SignalArray]]:
-        """Index, name and array of each signal."""
-        arrays, place = self.rows.take()
-        place *= _PLACES_PER_MESSAGE
-        fixed, values = [a[:, 0] for a in arrays[: self.layout.first]], arrays[self.layout.first :]
-        back = np.argsort(fixed[3], kind="stable") if self.layout.rows else slice(None)
-        time, host_time, marked = (column[back] for column in fixed[:3])
-        found = []
-        for bit, column in enumerate(self.layout.signals):
-            marks = (marked & np.uint64(1 << bit)) != 0
-            known = (column.quantity, column.unit, column.frame, column.clock, self.layout.stream, column.source)
-            array = SignalArray(time, values[bit][back], (place + bit)[back], host_time, marks, *known)
-            found.append((column.index, column.name, array))
-        return found
+def _stream_signals(layout: StreamLayout, rows: _Rows) -> list[tuple[int, str, SignalArray]]:
+    """Index, name and array of each signal of a stream; the messages are then dropped in `rows`."""
+    arrays, place = rows.take()
+    place *= _PLACES_PER_MESSAGE
+    fixed, values = [a[:, 0] for a in arrays[: layout.first]], arrays[layout.first :]
+    back = np.argsort(fixed[3], kind="stable") if layout.rows else slice(None)
+    time, host_time, marked = (column[back] for column in fixed[:3])
+    found = []
+    for bit, column in enumerate(layout.signals):
+        marks = (marked & np.uint64(1 << bit)) != 0
+        known = (column.quantity, column.unit, column.frame, column.clock, layout.stream, column.source)
+        array = SignalArray(time, values[bit][back], (place + bit)[back], host_time, marks, *known)
+        found.append((column.index, column.name, array))
+    return found
 
 
 class Content:
@@ -298,8 +287,8 @@ class Content:
         self.messages = 0
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, Any] = {}  # records, to notice another one with the same number
-        self._blocks: dict[int, _BlockChannel] = {}
-        self._streams: dict[int, _StreamChannel] = {}
+        self._blocks: dict[int, tuple[int, Block, _Rows]] = {}  # session first
+        self._streams: dict[int, tuple[StreamLayout, _Rows]] = {}
         self._kinds: dict[int, tuple[str, Any]] = {}
 
     @property
@@ -340,11 +329,11 @@ class Content:
                     raise ValueError("too many variables")
                 count = len(block.variables)
                 rows = _Rows(FixedMessages(["<i8", *["<f8"] * (1 + count)]), [1, 1, count], expected)
-                self._blocks[record.id] = _BlockChannel(block, schemas.session_of(record.metadata), rows)
+                self._blocks[record.id] = (schemas.session_of(record.metadata), block, rows)
             elif name.startswith("crazyem.signals."):
                 layout = StreamLayout.from_metadata(record.metadata)
                 groups = [*[1] * layout.first, *(s.width for s in layout.signals)]
-                self._streams[record.id] = _StreamChannel(layout, _Rows(layout.messages, groups, expected))
+                self._streams[record.id] = (layout, _Rows(layout.messages, groups, expected))
             elif name in _KINDS and record.topic == EVENT_TOPICS[_KINDS[name]][0]:
                 self._kinds[record.id] = (_KINDS[name], schemas.message_class(name))
             elif name == OTHER_EVENT_TOPIC[1]:
@@ -361,7 +350,7 @@ class Content:
             known = self._blocks.get(channel) or self._streams.get(channel)
             if known is not None:
                 mine = messages[:, 2] == channel
-                self.unreadable += known.rows.add(scan.data, messages[mine], places[mine])
+                self.unreadable += known[-1].add(scan.data, messages[mine], places[mine])
             elif channel in self._kinds:
                 others.append(channel)
         if others:
@@ -385,13 +374,13 @@ class Content:
     def tables(self) -> dict[int, list[Table]]:
         """Session -> tables of its log blocks; the rows are then dropped here."""
         sessions: dict[int, list[Table]] = {}
-        for channel in self._blocks.values():
-            sessions.setdefault(channel.session, []).append(channel.table())
+        for session, block, rows in self._blocks.values():
+            sessions.setdefault(session, []).append(_table(block, rows))
         return dict(sorted(sessions.items()))
 
     def streams(self) -> dict[str, SignalArray]:
         """Signals of an imported recording, in its order; the rows are then dropped here."""
-        found = [entry for channel in self._streams.values() for entry in channel.signals()]
+        found = [entry for stream in self._streams.values() for entry in _stream_signals(*stream)]
         return {name: array for _, name, array in sorted(found, key=lambda e: e[0])}
 
 
