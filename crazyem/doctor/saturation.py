@@ -8,7 +8,7 @@ import numpy as np
 from crazyem.doctor.streams import longest
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Grade, intervals_of, percent, runs_of
-from crazyem.recordings.ordering import Array, Flags, Intervals, inside, ordered
+from crazyem.recordings.ordering import Array, Flags, Intervals, inside, ordered, sound_signal
 from crazyem.recordings.recording import Recording
 
 FULL_DUTY = 0.999  # share of the largest duty that counts as full
@@ -116,6 +116,7 @@ def _lower(name: str, time: Array, value: Array, rows: Flags, flight: Airtime) -
 
 def _voltage(recording: Recording, times: Array) -> float:
     """Median voltage at these times; NaN without a voltage."""
-    array = recording.signals.get("voltage")
-    time, value = ordered(array) if array is not None else (np.empty(0), np.empty((0, 1)))
-    return float(np.median(np.interp(times, time, value[:, 0]))) if time.size >= 2 else math.nan
+    found = sound_signal(recording, "voltage")
+    if found is None or found[0].size < 2:
+        return math.nan
+    return float(np.median(np.interp(times, found[0], found[1][:, 0])))

@@ -82,8 +82,8 @@ def signal_for(recording: Recording, vehicle: Vehicle) -> tuple[str, str]:
             continue
         if _measured(recording, name) is None:
             why.append(f"{name} holds no numbers, or only zeros: no sensor is connected")
-        elif too_slow(recording, name):
-            why.append(too_slow(recording, name))
+        elif slow := too_slow(recording, name):
+            why.append(slow)
         elif name in _THRUST_LAWS and not getattr(vehicle, law := _THRUST_LAWS[name]):
             have = [preset for preset in preset_names() if getattr(load_vehicle(preset), law)]
             no_law = f"{name} is recorded, but not the thrust it gives: vehicle {vehicle.name} has no {law}"

@@ -274,12 +274,8 @@ def _factors(
     quantity: str, count: int, entry: Mapping[str, Any], above: float | None, where: str
 ) -> tuple[tuple[float, ...], tuple[tuple[float, ...], tuple[float, ...]]]:
     """Factors to SI in the order of the columns in the file, and two offsets: of the unit, and of the mapping."""
-    units = entry.get("unit", "")
-    units = units if isinstance(units, list) else [units] * count
-    scales = entry.get("scale", 1.0)
-    scales = scales if isinstance(scales, list) else [scales] * count
-    offsets = entry.get("offset", 0.0)
-    offsets = offsets if isinstance(offsets, list) else [offsets] * count
+    given = (entry.get(key, default) for key, default in (("unit", ""), ("scale", 1.0), ("offset", 0.0)))
+    units, scales, offsets = (value if isinstance(value, list) else [value] * count for value in given)
     if len(units) != count or not all(isinstance(u, str) for u in units):
         raise FileFormatError(f"{where}.unit: must be a text, or one for each of the {count} columns.")
     if len(scales) != count or not all(_is_number(s) and s != 0 for s in scales):
