@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from crazyem.errors import UsageError
 from crazyem.links.base import LinkStatistics, ParameterWrite
 from crazyem.recordings.mcap import schemas
-from crazyem.recordings.mcap.output import Output
+from crazyem.recordings.mcap.output import Output, reopen
 from crazyem.signals.sample import Block, Packet, Sample
 from crazyem.signals.vocabulary import BlockDecoder, decoders
 
@@ -100,8 +100,6 @@ class RecordingWriter:
         self._thread.start()
 
     def _reopen(self, path: Path) -> None:
-        from crazyem.recordings.mcap.output import reopen
-
         before = reopen(path)
         self._file = before.stream
         self._output = Output(self._file, book=before.book, offset=before.offset)
