@@ -39,7 +39,7 @@ def target(path: Path) -> Callable[[bytes], None]:
     """The function that is called with every input; `path` is where the input lies for the reader."""
     from crazyem.errors import CrazyemError
     from crazyem.recordings import open_recording
-    from crazyem.recordings.parts import can_be_parted, open_parts
+    from crazyem.recordings.registry import can_be_parted, open_parts
 
     def attempt(data: bytes) -> None:
         path.write_bytes(data)

@@ -195,7 +195,7 @@ def _reading(p: argparse.ArgumentParser) -> None:
 
 
 def _cutting(p: argparse.ArgumentParser) -> None:
-    """Options for the part of a recording to use (`crazyem.recordings.cut`)."""
+    """Options for the part of a recording to use (`crazyem.recordings.registry`)."""
     seconds = _number(-1e12, 1e12, " seconds")
     text = "only from this time on, in seconds as info and doctor show them"
     p.add_argument("--from", dest="start", type=seconds, metavar="S", help=text)

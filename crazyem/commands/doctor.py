@@ -13,7 +13,7 @@ from crazyem.commands.merge import merge_findings
 from crazyem.commands.output import Report, Result
 from crazyem.errors import DataError, UsageError
 from crazyem.recordings import Finding, Grade, ReadOptions, Recording, open_recording
-from crazyem.recordings.parts import open_parts, to_be_parted
+from crazyem.recordings.registry import open_parts, to_be_parted
 
 _TEXT_WIDTH = 110
 _SHOWN_INTERVALS = 4  # most intervals shown per finding

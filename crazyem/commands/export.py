@@ -8,7 +8,7 @@ from crazyem.commands.output import Report, Result, remarks
 from crazyem.errors import UsageError
 from crazyem.recordings import ReadOptions, open_recording
 from crazyem.recordings.export import EXPORT_SUFFIXES, METADATA_SUFFIX, export, export_parts
-from crazyem.recordings.parts import open_parts, to_be_parted
+from crazyem.recordings.registry import open_parts, to_be_parted
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -161,7 +161,7 @@ def _is_recording(path: Path, *, mapped: bool) -> bool:
 
 def _is_recording_folder(path: Path) -> bool:
     try:
-        return any(reader.recognises_folder(path) for reader in READERS)
+        return any(reader.recognises(path) for reader in READERS)
     except OSError:
         return False
 

@@ -9,7 +9,7 @@ from crazyem.commands.merge import merge_inventories
 from crazyem.commands.output import Report, Result
 from crazyem.physics import folding
 from crazyem.recordings import ReadOptions, open_recording
-from crazyem.recordings.parts import open_parts, to_be_parted
+from crazyem.recordings.registry import open_parts, to_be_parted
 
 
 def run(arguments: argparse.Namespace) -> int:

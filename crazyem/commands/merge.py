@@ -5,9 +5,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import fields, replace
 from typing import Any, TypeVar
 
-from crazyem.doctor.envelope import Envelope
 from crazyem.doctor.identifiability import Verdict
-from crazyem.doctor.inventory import ClockRow, Inventory, SignalRow
+from crazyem.doctor.inventory import ClockRow, Envelope, Inventory, SignalRow
 from crazyem.recordings.finding import Finding, Grade
 
 Row = TypeVar("Row", SignalRow, ClockRow, Verdict)

@@ -7,25 +7,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor import axes
-from crazyem.doctor.delays import delay
-from crazyem.doctor.kinematics import (
-    Track,
-    Window,
-    grid_of,
-    measurements,
-    origin_of,
-    rate_of_attitude,
-    track,
-    width_for,
-)
+from crazyem.doctor import kinematics
+from crazyem.doctor.hypotheses import sign_factor, signed
 from crazyem.doctor.regression import Choice, blocks, choose, slope
-from crazyem.doctor.streams import runs
 from crazyem.physics.rotations import euler_from_quaternion, rotate
-from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.finding import Finding, Fix, Grade, runs_of
+from crazyem.recordings.ordering import Array
 from crazyem.recordings.recording import Recording, SignalArray
-
-Array = NDArray[np.float64]
 
 DEGREES = 180.0 / math.pi
 ANGLE_UNITS = {"degrees": DEGREES, "converted": 1.0 / DEGREES}
@@ -47,16 +35,16 @@ def check(recording: Recording) -> list[Finding]:
     """Findings about every quaternion (against gyro and gravity) and all Euler angles (against quaternions)."""
     found: list[Finding] = []
     wrong: set[str] = set()
-    attitudes = measurements(recording, "attitude")
+    attitudes = kinematics.measurements(recording, "attitude")
     for name, array in attitudes.items():
         finding = _quaternion(name, array, recording)
         if finding is not None:
             found.append(finding)
             wrong.add(name)
     sound = {name: array for name, array in attitudes.items() if name not in wrong}
-    for name, array in measurements(recording, "euler").items():
+    for name, array in kinematics.measurements(recording, "euler").items():
         # a quaternion of the same origin first: one of another origin may have another heading, and a lag
-        ordered = sorted(sound, key=lambda other: origin_of(other) != origin_of(name))
+        ordered = sorted(sound, key=lambda other: kinematics.origin_of(other) != kinematics.origin_of(name))
         for other in ordered:
             findings = _euler(name, array, other, sound[other])
             if findings is not None:
@@ -97,18 +85,21 @@ def _quaternion(name: str, array: SignalArray, recording: Recording) -> Finding 
 
 def _by_rate(array: SignalArray, recording: Recording) -> tuple[str, dict[str, float]]:
     """The reading whose derivative agrees with the gyro ("" if the data do not decide), and evidence."""
-    for gyro in measurements(recording, "body_rate").values():
-        grid = grid_of(array, gyro)
-        window = Window(max(0.24, width_for(array, gyro)))
-        smooth = {key: window.mean(rate_of_attitude(track(reading(array, key), grid))) for key in READINGS}
-        raw = track(gyro, grid)
+    for gyro in kinematics.measurements(recording, "body_rate").values():
+        grid = kinematics.grid_of(array, gyro)
+        window = kinematics.Window(max(0.24, kinematics.width_for(array, gyro)))
+        smooth = {
+            key: window.mean(kinematics.rate_of_attitude(kinematics.track(reading(array, key), grid)))
+            for key in READINGS
+        }
+        raw = kinematics.track(gyro, grid)
         # a conjugate turns the other way about nearly the same axes: one reading of each order suffices for the lag
-        lags = [delay(one, window.mean(raw)) for one in list(smooth.values())[:2]]
+        lags = [kinematics.delay(one, window.mean(raw)) for one in list(smooth.values())[:2]]
         good = [one for one in lags if one is not None and not one.at_edge]
         if not good:
             continue
         late = max(good, key=lambda one: one.explained)
-        measured = window.mean(track(gyro, grid, shift=late.value))
+        measured = window.mean(kinematics.track(gyro, grid, shift=late.value))
         valid = measured.valid & np.logical_and.reduce([one.valid for one in smooth.values()])
         rows = np.flatnonzero(valid)[::3]
         if rows.size < 100 or float(measured.value[rows].std()) < 0.04:
@@ -131,14 +122,14 @@ def _explained(choice: Choice) -> dict[str, float]:
 
 def _by_gravity(array: SignalArray, recording: Recording) -> dict[str, float] | None:
     """For each reading, the cosine between up and the mean specific force in the world frame."""
-    for force in measurements(recording, "specific_force").values():
-        grid = grid_of(array, force)
+    for force in kinematics.measurements(recording, "specific_force").values():
+        grid = kinematics.grid_of(array, force)
         if grid.size == 0:
             continue
-        felt = track(force, grid)
+        felt = kinematics.track(force, grid)
         out = {}
         for key in READINGS:
-            attitude = track(reading(array, key), grid)
+            attitude = kinematics.track(reading(array, key), grid)
             valid = felt.valid & attitude.valid
             if valid.sum() < 200:
                 return None
@@ -150,14 +141,14 @@ def _by_gravity(array: SignalArray, recording: Recording) -> dict[str, float] | 
 
 def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -> list[Finding] | None:
     """Findings; None if the data allow no judgement."""
-    grid = grid_of(array, quaternion)
-    window = Window(max(0.1, width_for(array, quaternion) / 2))
-    truth = track(_unwrapped(quaternion), grid)
+    grid = kinematics.grid_of(array, quaternion)
+    window = kinematics.Window(max(0.1, kinematics.width_for(array, quaternion) / 2))
+    truth = kinematics.track(_unwrapped(quaternion), grid)
     straight = _continuous_angles(array)
-    late = delay(window.mean(truth), window.mean(track(straight, grid)), reach=0.15)
+    late = kinematics.delay(window.mean(truth), window.mean(kinematics.track(straight, grid)), reach=0.15)
     lag = late.value if late is not None and not late.at_edge and late.explained > 0.5 else 0.0
-    x, y = window.mean(truth), window.mean(track(straight, grid, shift=lag))
-    rows = np.flatnonzero(_upright(track(quaternion, grid), x.valid & y.valid))[::3]
+    x, y = window.mean(truth), window.mean(kinematics.track(straight, grid, shift=lag))
+    rows = np.flatnonzero(_upright(kinematics.track(quaternion, grid), x.valid & y.valid))[::3]
     if rows.size < 100:
         return None
     block = blocks(grid.time[rows])
@@ -190,7 +181,7 @@ def _euler_findings(
     """Finding by the best reading of Euler angles: an inverted sign, another order or unit."""
     if choice.denied:
         what = choice.name.removeprefix("as declared ")
-        factor = axes.sign_factor(what, ANGLE_NAMES) if choice.name else None
+        factor = sign_factor(what, ANGLE_NAMES) if choice.name else None
         if factor is not None:
             turned = " and ".join(ANGLE_NAMES[i] for i in range(3) if factor[i] < 0)
             text = f"{head}the sign of {turned} is inverted."
@@ -210,12 +201,12 @@ def _euler_findings(
     return [Finding("angles", Grade.UNUSABLE, text, name, (), evidence, "Correct its unit.", fix)]
 
 
-def _upright(attitude: Track, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _upright(attitude: kinematics.Track, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(m,) True in the longest stretch in which roll and pitch are far from the jumps of Euler angles."""
     angles = np.abs(euler_from_quaternion(attitude.value))
     far = (angles[:, 0] < LARGEST_ANGLES[0]) & (angles[:, 1] < LARGEST_ANGLES[1]) | ~attitude.valid
     out = np.zeros(valid.size, bool)
-    first, last = max(runs(far), key=np.ptp, default=(0, 0))
+    first, last = max(runs_of(far), key=np.ptp, default=(0, 0))
     out[first:last] = True
     return out & valid
 
@@ -228,7 +219,7 @@ def _unit_variance(value: Array) -> Array:
 def _orders(x: Array, known: NDArray[np.bool_]) -> dict[str, tuple[int, Array]]:
     """Hypotheses of signs, and of the order yaw, pitch, roll; components that are not `known` are zero."""
     out = {}
-    for key, (cost, value) in axes.signed("as declared", x, ANGLE_NAMES).items():
+    for key, (cost, value) in signed("as declared", x, ANGLE_NAMES).items():
         if cost <= 2 or [part.lstrip("-") for part in key.split(" ")[-3:]] == ["yaw,", "pitch,", "roll"]:
             out[key] = (cost, value * known)
     return out

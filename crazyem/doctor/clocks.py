@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from crazyem.doctor.streams import Stream, cadence, listed, longest, sole, streams
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
+from crazyem.recordings.ordering import Array
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.stamps import RESTART_SECONDS
-
-Column = NDArray[np.float64]
 
 # Counters that overflow: name -> seconds from zero to the overflow
 CLOCK_WRAPS: dict[str, float] = {
@@ -182,7 +181,7 @@ def _rate_finding(nominal: float, real: float, names: list[str]) -> Finding:
 # -- against the host -------------------------------------------------------------------------------------------------
 
 
-def _arrivals(stream: Stream) -> tuple[Column, Column, NDArray[np.int64]] | None:
+def _arrivals(stream: Stream) -> tuple[Array, Array, NDArray[np.int64]] | None:
     """Stamps, arrival times less stamps, and rows of the samples with arrival times; None if they cannot be used."""
     array = stream.arrays[0]
     known = np.isfinite(array.host_time)
@@ -195,7 +194,7 @@ def _arrivals(stream: Stream) -> tuple[Column, Column, NDArray[np.int64]] | None
     return time, offset, np.flatnonzero(known)
 
 
-def _jumps(stream: Stream, time: Column, offset: Column, rows: NDArray[np.int64]) -> Iterator[Finding]:
+def _jumps(stream: Stream, time: Array, offset: Array, rows: NDArray[np.int64]) -> Iterator[Finding]:
     # the delay of a late packet passes, a jump of the clock stays: so samples before and after are compared
     candidates = np.flatnonzero(np.abs(np.diff(offset)) > CLOCK_JUMP)[:1000]
     # packets in a queue arrive late, never early: so the earliest arrivals show the clocks
@@ -215,7 +214,7 @@ def _jumps(stream: Stream, time: Column, offset: Column, rows: NDArray[np.int64]
     yield Finding("clocks", Grade.DEGRADES, text, "", spans, {"jumps": at.size, "largest_s": -worst}, advice, fix)
 
 
-def _drift(time: Column, offset: Column, *, several: bool) -> Iterator[Finding]:
+def _drift(time: Array, offset: Array, *, several: bool) -> Iterator[Finding]:
     """Drift from a line through the earliest arrival of each of twenty spans, because delays are never negative."""
     duration = float(time[-1] - time[0])
     if duration < 5.0 or np.abs(np.diff(offset)).max() > CLOCK_JUMP:

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from crazyem.recordings.finding import Finding, Grade
-from crazyem.recordings.ordering import sound_samples
+from crazyem.recordings.ordering import Array, sound_samples
 from crazyem.recordings.recording import Recording, SignalArray
 
-Array = NDArray[np.float64]
 Hashes = NDArray[np.uint32]
 
 TURNING_POINT_NEIGHBOURS = 6  # samples on each side that a turning point is compared with
@@ -142,9 +141,8 @@ def _channels(recording: Recording) -> list[tuple[Array, Array]]:
 
 
 def _rank(name: str, array: SignalArray) -> tuple[int, str]:
-    quantity = array.quantity
-    place = _PREFERRED_SIGNALS.index(quantity) if quantity in _PREFERRED_SIGNALS else len(_PREFERRED_SIGNALS)
-    return 2 * place + ("@" in name), name
+    known = [*_PREFERRED_SIGNALS, array.quantity]
+    return 2 * known.index(array.quantity) + ("@" in name), name
 
 
 def _numbers(time: Array, value: Array) -> tuple[Hashes, Array]:

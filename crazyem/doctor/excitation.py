@@ -19,10 +19,9 @@ from crazyem.doctor.kinematics import turn
 from crazyem.doctor.regression import AUTOREGRESSION_ORDER, Fit, autoregression, filtered, long_run, widened
 from crazyem.physics.lag import CAUSAL, LINEAR, fit_predictor, hold_predictor, lagged_means
 from crazyem.recordings.airborne import Airtime
+from crazyem.recordings.ordering import Array
 from crazyem.recordings.thrust import Inputs
 from crazyem.vehicle import GRAVITY, Vehicle
-
-Array = NDArray[np.float64]
 
 FINEST_STEP = 4e-3  # s; faster streams are averaged into steps of 5 ms
 AVERAGED_STEP = 5e-3
@@ -126,9 +125,7 @@ def rotation_fit(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | None:
     A wrong model (aerodynamic torque, a lag that varies) gives another inertia in every quarter.
     """
     fit = rotation_fit_once(inputs, steps, vehicle)
-    if fit is None:
-        return None
-    return widened(fit, [rotation_fit_once(inputs, part, vehicle) for part in quarters(steps)])
+    return fit and widened(fit, [rotation_fit_once(inputs, part, vehicle) for part in quarters(steps)])
 
 
 def quarters(steps: Steps) -> list[Steps]:
@@ -137,10 +134,9 @@ def quarters(steps: Steps) -> list[Steps]:
     parts = []
     for low, high in pairwise(edges):
         inside = [(t >= low) & (t <= high) for t in steps.nodes]
-        pieces = [(t[i], v[i]) for t, v, i in zip(steps.nodes, steps.values, inside)]
-        kept = [piece for piece in pieces if piece[0].size > 3 * AUTOREGRESSION_ORDER]
-        if kept:
-            nodes, values = zip(*kept)
+        long = [i for i, rows in enumerate(inside) if rows.sum() > 3 * AUTOREGRESSION_ORDER]
+        if long:
+            nodes, values = zip(*((steps.nodes[i][inside[i]], steps.values[i][inside[i]]) for i in long))
             parts.append(Steps(nodes, values, steps.period, steps.share))
     return parts
 

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from crazyem.doctor import CHECKS, Check
 from crazyem.doctor.kinematics import continuous
-from crazyem.doctor.streams import runs as runs_of
 from crazyem.physics.rotations import rotation_matrix
-from crazyem.recordings.finding import Finding, Fix
+from crazyem.recordings.finding import Finding, Fix, runs_of
 from crazyem.recordings.ordering import Array, sound_rows, sound_samples
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -81,43 +80,35 @@ def _again(recording: Recording, finding: Finding) -> Finding | None:
     check = _check_of(finding)
     if check is None:
         return finding
-    return next((f for f in check.run(recording) if _same(f, finding)), None)
+    return next((f for f in check.run(recording) if _wish(f) == _wish(finding)), None)
+
+
+def _wish(finding: Finding) -> object:
+    """Equal for findings that ask for a repair of one kind of the same signals."""
+    fix = finding.fix
+    return finding.check, finding.signal, fix and (fix.kind, frozenset(fix.signals))
 
 
 def _check_of(finding: Finding) -> Check | None:
     return next((check for check in CHECKS if check.module == finding.check), None)
 
 
-def _same(one: Finding, other: Finding) -> bool:
-    """Whether two findings ask for a repair of one kind of the same signals."""
-    a, b = one.fix, other.fix
-    if a is None or b is None:
-        return False
-    alike = (one.check, one.signal, a.kind) == (other.check, other.signal, b.kind)
-    return alike and set(a.signals) == set(b.signals)
-
-
 def _possible(recording: Recording, fix: Fix | None) -> bool:
     """Whether a fix is well formed and can be undone."""
-    if fix is None or fix.kind not in _REPAIRS or not fix.signals:
+    if fix is None or fix.kind not in _REPAIRS or not fix.signals or not all(map(math.isfinite, fix.factor)):
         return False
-    if not all(math.isfinite(f) for f in fix.factor):
-        return False
-    for name in fix.signals:
-        array, rows = recording.signals.get(name), fix.rows
-        if array is None:
+    arrays, rows, count = [recording.signals.get(name) for name in fix.signals], fix.rows, len(fix.factor)
+    for array in arrays:
+        if array is None or (rows is not None and rows.size and not 0 <= rows.min() <= rows.max() < array.time.size):
             return False
-        if rows is not None and rows.size and (rows.min() < 0 or rows.max() >= array.time.size):
+        width = array.value.shape[1]
+        if fix.kind == "scale" and (count not in (1, width) or 0.0 in fix.factor):
             return False
-        if fix.kind == "scale" and (len(fix.factor) not in (1, array.value.shape[1]) or 0.0 in fix.factor):
+        if fix.kind == "world_to_body" and (width != 3 or "attitude" not in recording.signals):
             return False
-        if fix.kind == "world_to_body" and (array.value.shape[1] != 3 or "attitude" not in recording.signals):
-            return False
-    if fix.kind == "shift":
-        return len(fix.factor) == 1
     if fix.kind == "unwrap":
-        return fix.rows is not None and len(fix.factor) == fix.rows.size
-    return fix.kind != "mark" or fix.rows is not None
+        return rows is not None and count == rows.size
+    return (fix.kind != "shift" or count == 1) and (fix.kind != "mark" or rows is not None)
 
 
 # kinds ---------------------------------------------------------------------------------------------------------

@@ -9,9 +9,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from crazyem.doctor.streams import longest, runs
+from crazyem.doctor.kinematics import upright
+from crazyem.doctor.streams import longest
 from crazyem.recordings.airborne import Airtime, airtime
-from crazyem.recordings.finding import Finding, Grade, intervals_of
+from crazyem.recordings.finding import Finding, Grade, intervals_of, runs_of
 from crazyem.recordings.ordering import Array, Intervals, inside, ordered
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.thrust import is_rotorcraft, kind_objection
@@ -93,13 +94,11 @@ def _tilt(recording: Recording) -> tuple[Array, Array] | None:
     if array is None:
         return None
     time, q = ordered(array)
-    norm = np.einsum("ij,ij->i", q, q)
-    sound = norm > 0.5
-    time, q, norm = time[sound], q[sound], norm[sound]
+    sound = np.einsum("ij,ij->i", q, q) > 0.5
+    time, q = time[sound], q[sound]
     if time.size < 10:
         return None
-    up = 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2) / norm
-    return time, np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))
+    return time, np.degrees(np.arccos(np.clip(upright(q), -1.0, 1.0)))
 
 
 def _upsets(flight: Airtime, tilt: tuple[Array, Array] | None) -> Iterator[Finding]:
@@ -108,7 +107,7 @@ def _upsets(flight: Airtime, tilt: tuple[Array, Array] | None) -> Iterator[Findi
     time, angle = tilt
     rows = inside(time, flight.airborne) & (angle > UPSET_TILT)
     # one or two samples are bad numbers, not a roll-over
-    for first, last in runs(rows):
+    for first, last in runs_of(rows):
         if last - first < 3:
             rows[first:last] = False
     if not rows.any():

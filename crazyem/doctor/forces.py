@@ -5,8 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from crazyem.doctor import axes
-from crazyem.doctor.hypotheses import Comparison, compare_hypotheses, misread, wrong_unit
+from crazyem.doctor import hypotheses
 from crazyem.doctor.kinematics import (
     GRAVITY,
     GRID_STEP,
@@ -113,7 +112,7 @@ def _specific_force(
     return [_structure(name, seen)] if seen.choice.denied else _judge_level(name, *_level(seen), seen)
 
 
-def _compare(array: SignalArray, pose: str, turning: SignalArray, moving: SignalArray) -> Comparison | None:
+def _compare(array: SignalArray, pose: str, turning: SignalArray, moving: SignalArray) -> hypotheses.Comparison | None:
     grid = grid_of(array, turning, moving)
     acceleration = _acceleration_of(moving, grid)
     attitude = track(turning, grid)
@@ -129,10 +128,12 @@ def _compare(array: SignalArray, pose: str, turning: SignalArray, moving: Signal
         "world, gravity removed": (2, Track(kinematic, valid)),
     }
     width = max(FORCE_WINDOW, width_for(array, turning, moving))
-    return compare_hypotheses(array, grid, f"{pose} and motion", candidates, width=width, least=LEAST_FORCE_RMS)
+    return hypotheses.compare_hypotheses(
+        array, grid, f"{pose} and motion", candidates, width=width, least=LEAST_FORCE_RMS
+    )
 
 
-def _level(seen: Comparison) -> tuple[float, float]:
+def _level(seen: hypotheses.Comparison) -> tuple[float, float]:
     """Mean of the measurement along the predicted mean, divided by the size of that mean; and its standard error."""
     size = float(np.linalg.norm(seen.predicted))
     return float(seen.mean @ seen.predicted) / size**2, float(np.linalg.norm(seen.mean_error)) / size
@@ -154,7 +155,7 @@ def _by_weight(name: str, array: SignalArray, attitudes: list[SignalArray]) -> l
 
 
 def _judge_level(
-    name: str, level: float, error: float, seen: Comparison | None, *, signed: bool = True
+    name: str, level: float, error: float, seen: hypotheses.Comparison | None, *, signed: bool = True
 ) -> list[Finding]:
     """Findings about unit, gravity, sign and scale of a specific force, from its mean over the weight (`level`)."""
     evidence = {"gravity_level": level, "gravity_level_error": error, **(seen.evidence() if seen else {})}
@@ -163,7 +164,7 @@ def _judge_level(
     for unit, factor in FORCE_UNITS.items():
         if abs(math.log(max(abs(level), 1e-9) / factor)) < math.log(1.3) and (level > 0 or not signed):
             text = f"{head}{_unit_said(unit)}, not m/s^2."
-            return [wrong_unit("forces", name, text, factor, evidence, advice)]
+            return [hypotheses.wrong_unit("forces", name, text, factor, evidence, advice)]
     if seen is None and not signed:
         return []
     if abs(level) < 0.3:
@@ -173,7 +174,7 @@ def _judge_level(
             return [Finding("forces", Grade.UNUSABLE, text, name, (), evidence, "Add gravity again, or read it so.")]
         return []
     if level < -0.7:
-        return [wrong_unit("forces", name, f"{head}its sign is inverted.", -1.0, evidence, advice)]
+        return [hypotheses.wrong_unit("forces", name, f"{head}its sign is inverted.", -1.0, evidence, advice)]
     if seen is not None and abs(level - 1.0) >= SCALE_FAULT and abs(level - 1.0) > 4.0 * error:
         return [_scale(name, level, error, seen, evidence)]
     return []
@@ -183,7 +184,9 @@ def _unit_said(unit: str) -> str:
     return "it was converted from g once too often" if unit == "g taken twice" else f"it is in {unit}"
 
 
-def _scale(name: str, level: float, error: float, seen: Comparison, evidence: Mapping[str, float]) -> Finding:
+def _scale(
+    name: str, level: float, error: float, seen: hypotheses.Comparison, evidence: Mapping[str, float]
+) -> Finding:
     """Finding about a level wrong by some per cent: a scale fault or a vertical bias, by the changes of the force."""
     whole = seen.whole
     interval = f"{level:.3f} ({level - 2 * error:.3f} to {level + 2 * error:.3f})"
@@ -205,13 +208,13 @@ def _scale(name: str, level: float, error: float, seen: Comparison, evidence: Ma
     return Finding("forces", Grade.DEGRADES, text, name, (), numbers, advice, fix)
 
 
-def _structure(name: str, seen: Comparison) -> Finding:
+def _structure(name: str, seen: hypotheses.Comparison) -> Finding:
     known = _FORCE_MISREAD
     fix: Fix | None = Fix("world_to_body", (name,))
     if abs(_level(seen)[0]) < 0.3 * abs(seen.whole.value if seen.whole else 1.0):  # a force has gravity in its mean
         known = known | {"world": (_WITHOUT_GRAVITY.format("world"), "Read it as acceleration.")}
         fix = None
-    return misread("forces", name, seen, known, noun="specific force", what="", fix=fix)
+    return hypotheses.misread("forces", name, seen, known, noun="specific force", what="", fix=fix)
 
 
 def _acceleration(name: str, array: SignalArray, moving: SignalArray, attitudes: list[SignalArray]) -> list[Finding]:
@@ -225,7 +228,7 @@ def _acceleration(name: str, array: SignalArray, moving: SignalArray, attitudes:
         force = kinematic.value + GRAVITY * UP
         candidates["specific force"] = (1, Track(rotate(attitude.value, force, inverse=True), valid))
     width = max(FORCE_WINDOW, width_for(array, moving))
-    seen = compare_hypotheses(
+    seen = hypotheses.compare_hypotheses(
         array, grid, f"the derivative of the {moving.quantity}", candidates, width=width, least=LEAST_FORCE_RMS
     )
     if seen is None or seen.whole is None or seen.explained < LEAST_EXPLAINED_SHARE:
@@ -233,21 +236,21 @@ def _acceleration(name: str, array: SignalArray, moving: SignalArray, attitudes:
     evidence = seen.evidence()
     head = f"{name} against {seen.against}: "
     if seen.choice.denied:
-        return [misread("forces", name, seen, _ACCELERATION_MISREAD, noun="world's", what="")]
-    unit = axes.known_factor(seen.whole, FORCE_UNITS)
+        return [hypotheses.misread("forces", name, seen, _ACCELERATION_MISREAD, noun="world's", what="")]
+    unit = hypotheses.known_factor(seen.whole, FORCE_UNITS)
     if unit:
         text = f"{head}it is {seen.whole.value:.4g} times as large: {_unit_said(unit[0])}, not m/s^2."
-        return [wrong_unit("forces", name, text, unit[1], evidence, "Correct its unit where it is read.")]
+        return [hypotheses.wrong_unit("forces", name, text, unit[1], evidence, "Correct its unit where it is read.")]
     level = float(seen.mean[2] - seen.whole.value * seen.predicted[2]) / (GRAVITY * seen.whole.value)
     if abs(level - 1.0) < 0.3:
         text = f"{head}gravity is still in it (its mean is {seen.mean[2]:.2f} m/s^2 along z)."
         numbers = {**evidence, "gravity_level": level}
         return [Finding("forces", Grade.UNUSABLE, text, name, (), numbers, "Take gravity off its z.")]
-    fault = axes.scale_fault(seen.whole, seen.single, SCALE_FAULT) if seen.covered >= 0.5 else None
+    fault = hypotheses.scale_fault(seen.whole, seen.single, SCALE_FAULT) if seen.covered >= 0.5 else None
     if fault is None:
         return []
     text = f"{head}{fault.text}."
-    numbers = {**evidence, **axes.numbers(seen.single)}
+    numbers = {**evidence, **hypotheses.slope_numbers(seen.single)}
     advice = (
         "Use the derivative of the velocity; a tilt that its filter takes for larger than it is makes such a factor."
     )

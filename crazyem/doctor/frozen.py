@@ -6,14 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import COMMAND_SIGNALS, listed, longest, runs, same_as_before
+from crazyem.doctor.streams import COMMAND_SIGNALS, listed, longest, same_as_before
 from crazyem.recordings.airborne import Airtime, airtime
-from crazyem.recordings.finding import Finding, Fix, Grade, percent
-from crazyem.recordings.ordering import inside
+from crazyem.recordings.finding import Finding, Fix, Grade, percent, runs_of
+from crazyem.recordings.ordering import Flags, inside
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.thrust import UNKNOWN_VOLTAGE_ERROR, flat_voltage
-
-Flags = NDArray[np.bool_]
 
 # Shortest stretch without any change that counts as stuck [s]. Noise changes inertial sensors at every sample; a pose
 # in steps of a millimetre, or a quaternion in steps of 0.16 degrees, may stay constant for a while in a hover.
@@ -151,7 +149,7 @@ def _signal(recording: Recording, name: str, array: SignalArray, flight: Airtime
 
 def _stretches(array: SignalArray, flags: Flags, least: float) -> list[tuple[int, int]]:
     """(first row, row after the last) of unusually long still stretches; the first row is the last true sample."""
-    spans = runs(flags)
+    spans = runs_of(flags)
     if not spans.size:
         return []
     lengths = spans[:, 1] - spans[:, 0]

@@ -1,12 +1,10 @@
 """Check: gaps and dropped records, each stream against its own period; pauses of the whole recording separately."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor.streams import Cadence, Stream, cadence, graded, listed, longest, sole, streams
-from crazyem.recordings.finding import Finding, Grade, percent
+from crazyem.recordings.finding import Finding, Grade, note, percent
 from crazyem.recordings.ordering import Intervals
 from crazyem.recordings.recording import Recording
 
@@ -46,7 +44,9 @@ def check(recording: Recording) -> list[Finding]:
                 unused += [stream.name for stream in sharing]
             for stream in sharing:
                 ends += _ends(stream, rhythm, begin, end)
-    found += _unused(unused)
+    if unused:
+        text = f"{listed(unused)}: records missing, or published on change; nothing here uses them."
+        found.append(note("gaps", text, advice="Nothing to do.", streams=len(unused)))
     return found + _end_findings(ends, end - begin)
 
 
@@ -56,14 +56,6 @@ def _known_losses(recording: Recording, sharing: list[Stream]) -> Intervals | No
     if not all(stream.name in counts for stream in sharing):
         return None
     return tuple(span for f in recording.findings if f.check == "gaps" and "lost" in f.evidence for span in f.intervals)
-
-
-def _unused(names: list[str]) -> list[Finding]:
-    """One finding for all irregular streams that no part of the program uses."""
-    if not names:
-        return []
-    text = f"{listed(names)}: records missing, or published on change; nothing here uses them."
-    return [Finding("gaps", Grade.HARMLESS, text, evidence={"streams": len(names)}, advice="Nothing to do.")]
 
 
 def lost_records(time: NDArray[np.float64], period: float) -> NDArray[np.int64]:
@@ -176,14 +168,8 @@ def _number(count: int, word: str) -> str:
     return f"{count} {word}" if count == 1 else f"{count} {word}s"
 
 
-@dataclass(frozen=True, slots=True)
-class _End:
-    """An interval at the start or the end (`last`) of the recording without values of a signal."""
-
-    name: str
-    last: bool
-    start: float
-    end: float
+# signal; whether at the end of the recording; start and end [s] of the interval without values
+_End = tuple[str, bool, float, float]
 
 
 def _ends(stream: Stream, rhythm: Cadence, begin: float, end: float) -> list[_End]:
@@ -197,9 +183,9 @@ def _ends(stream: Stream, rhythm: Cadence, begin: float, end: float) -> list[_En
         if there.size:
             first, last = float(array.time[there[0]]), float(array.time[there[-1]])
             if end - last > least:
-                found.append(_End(name, True, last, end))
+                found.append((name, True, last, end))
             if first - begin > least:
-                found.append(_End(name, False, begin, first))
+                found.append((name, False, begin, first))
     return found
 
 
@@ -207,16 +193,16 @@ def _end_findings(ends: list[_End], duration: float) -> list[Finding]:
     """One finding for all signals that end, or begin, at about the same time."""
     found = []
     while ends:
-        one = ends[0]
-        alike = [e for e in ends if e.last == one.last]
-        close = [e for e in alike if abs(e.start - one.start) + abs(e.end - one.end) < SIMULTANEOUS_SECONDS]
+        _, last, start, end = ends[0]
+        alike = [e for e in ends if e[1] == last]
+        close = [e for e in alike if abs(e[2] - start) + abs(e[3] - end) < SIMULTANEOUS_SECONDS]
         ends = [e for e in ends if e not in close]
-        names = [e.name for e in close]
-        silent = max(e.end - e.start for e in close)
+        names = [e[0] for e in close]
+        silent = max(e[3] - e[2] for e in close)
         share = silent / max(duration, 1e-9)
-        text = f"{listed(names)}: no values in the {'last' if one.last else 'first'} {silent:.1f} s of the recording."
+        text = f"{listed(names)}: no values in the {'last' if last else 'first'} {silent:.1f} s of the recording."
         evidence = {"silent_s": silent, "share": share, "signals": len(names)}
         advice = "Use only the part of the flight in which all needed signals are there (--from, --to)."
-        spans = ((min(e.start for e in close), max(e.end for e in close)),)
+        spans = ((min(e[2] for e in close), max(e[3] for e in close)),)
         found.append(Finding("gaps", graded(share, degrades=0.1), text, sole(names), spans, evidence, advice))
     return found

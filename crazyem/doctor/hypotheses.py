@@ -1,8 +1,10 @@
 """Comparison of a measurement with predictions from other streams; the checks of rates, velocities and forces use it.
 
-Each prediction belongs to a hypothesis about the measurement's frame, axes or meaning.
+Each prediction belongs to a hypothesis about the measurement's frame, axes or meaning. A slope near a known factor is
+another unit, another slope is a scale fault.
 """
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,19 +12,101 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor import axes
-from crazyem.doctor.delays import delay
-from crazyem.doctor.kinematics import Grid, Track, Window, track
+from crazyem.doctor.kinematics import Grid, Track, Window, delay, track
 from crazyem.doctor.regression import Choice, Slope, blocks, choose, slope
 from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.ordering import Array
 from crazyem.recordings.recording import SignalArray
-
-Array = NDArray[np.float64]
 
 SLOPE_WINDOW = 0.5  # s, window for slopes: filters of streams do not change motion this slow
 ROW_STRIDE = 3  # grid steps between rows; more in recordings of more than a few minutes
 MOST_COMPARED_ROWS = 6000  # most rows of a comparison
 LEAST_SCALE_COVERAGE = 0.5  # least share of the time that the data of a scale fault cover
+SCALE_TOLERANCE = 0.02  # relative; sensors and filters in good order differ by this much
+FEWEST_SCALE_BLOCKS = 5.0  # least number of blocks (of 1.5 s or more) of motion for a scale fault
+_AXIS_NAMES = "xyz"
+_FACTOR_TOLERANCE = math.log(1.2)  # largest |log| of a slope over a known factor
+
+
+def signed(label: str, vector: Array, names: Sequence[str] = _AXIS_NAMES) -> dict[str, tuple[int, Array]]:
+    """All 48 signed orders of the components of (n, 3): name -> (cost, values); the unchanged order is first.
+
+    The cost is lower for simpler hypotheses: 1 for a sign (2 for all three), 2 more for another order. Names: "body",
+    "body x, -y, z", "body y, x, z".
+    """
+    out: dict[str, tuple[int, Array]] = {}
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            flipped = sum(s < 0 for s in signs)
+            cost = (2 if flipped == 3 else flipped) + (0 if order == (0, 1, 2) else 2)
+            parts = ("-" * (s < 0) + names[i] for s, i in zip(signs, order, strict=True))
+            name = label if cost == 0 else f"{label} " + ", ".join(parts)
+            out[name] = (cost, vector[:, order] * np.array(signs))
+    return out
+
+
+def sign_factor(name: str, names: Sequence[str] = _AXIS_NAMES) -> tuple[float, ...] | None:
+    """Factors that undo signs named by `signed` ("x, -y, z"), None if the order changed."""
+    parts = name.split(", ")
+    if [part.lstrip("-") for part in parts] != list(names):
+        return None
+    return tuple(-1.0 if part.startswith("-") else 1.0 for part in parts)
+
+
+def known_factor(found: Slope, known: Mapping[str, float]) -> tuple[str, float] | None:
+    """Name and value of the known factor within 20 % of a slope; None if there is none."""
+    if found.value <= 0.0:
+        return None
+    for name, factor in known.items():
+        if abs(math.log(found.value / factor)) < _FACTOR_TOLERANCE:
+            return name, factor
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleFault:
+    """A scale that is not 1. `text` names the scales and intervals; `repair` has the factors to multiply with."""
+
+    text: str
+    repair: tuple[float, ...]
+
+
+def scale_fault(whole: Slope | None, single: Sequence[Slope | None], least: float) -> ScaleFault | None:
+    """A scale fault of all or some components; None if no slope is at least `least` from 1 with certainty.
+
+    Args:
+        whole: slope of all components together.
+        single: of each component.
+        least: deviation from 1 that matters.
+    """
+    known = [s for s in single if s is not None]
+    # one factor for all, if no component contradicts it
+    if whole is not None and _off(whole, least) and all(s.low <= whole.high and s.high >= whole.low for s in known):
+        return ScaleFault(f"its scale is {_said(whole)}", (1.0 / whole.value,) * len(single))
+    off = {i: s for i, s in enumerate(single) if s is not None and _off(s, least)}
+    if not off:
+        return None
+    said = [f"{_AXIS_NAMES[i]} {_said(s)}" for i, s in off.items()]
+    repair = tuple(1.0 / off[i].value if i in off else 1.0 for i in range(len(single)))
+    return ScaleFault("its scale is " + ", ".join(said), repair)
+
+
+def slope_numbers(single: Sequence[Slope | None]) -> dict[str, float]:
+    """Slopes of the components with their intervals, as evidence."""
+    out: dict[str, float] = {}
+    for axis, s in zip(_AXIS_NAMES, single, strict=False):
+        if s is not None:
+            out |= {f"slope_{axis}": s.value, f"slope_{axis}_low": s.low, f"slope_{axis}_high": s.high}
+    return out
+
+
+def _off(s: Slope, least: float) -> bool:
+    certain = s.far_low > 1.0 + SCALE_TOLERANCE or s.far_high < 1.0 - SCALE_TOLERANCE
+    return abs(s.value - 1.0) >= least and certain and s.explained > 0.8 and s.blocks >= FEWEST_SCALE_BLOCKS
+
+
+def _said(s: Slope) -> str:
+    return f"{s.value:.3f} ({s.low:.3f} to {s.high:.3f})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +184,7 @@ def compare_hypotheses(
     y = measured.value[rows]
     block = blocks(grid.time[rows])
     chosen = {name: (cost, smooth[name].value[rows]) for name, (cost, _) in candidates.items()}
-    for name, (cost, value) in axes.signed(next(iter(chosen)), chosen[next(iter(chosen))][1]).items():
+    for name, (cost, value) in signed(next(iter(chosen)), chosen[next(iter(chosen))][1]).items():
         chosen.setdefault(name, (cost, value))
     choice = choose(y, chosen, block, offset=offset)
     if choice is None:
@@ -126,6 +210,8 @@ def _comparison(
     single = tuple(slope(x[:, i], y[:, i], block) for i in range(3))
     factor = 1.0 if whole is None or whole.far_low <= 1.0 <= whole.far_high else whole.value
     rest = y - factor * x
+    square = float((at * at).sum())
+    ratio = float((at * y).sum()) / square if square > 0 else 1.0
     return Comparison(
         against=against,
         choice=choice,
@@ -137,11 +223,11 @@ def _comparison(
         covered=covered,
         mean=y.mean(axis=0),
         predicted=at.mean(axis=0),
-        mean_error=_error(y - at * _ratio(y, at), block),
+        mean_error=_error(y - at * ratio, block),
     )
 
 
-def agreed_scale(looks: Sequence[Comparison], least: float) -> tuple[Comparison, axes.ScaleFault, int] | None:
+def agreed_scale(looks: Sequence[Comparison], least: float) -> tuple[Comparison, ScaleFault, int] | None:
     """A scale fault on which all comparisons agree; None if a precise comparison does not show it.
 
     The reference may be wrong itself (an onboard attitude follows its own filter), so all references must show the
@@ -152,7 +238,7 @@ def agreed_scale(looks: Sequence[Comparison], least: float) -> tuple[Comparison,
     for one in looks:
         if one.whole is None or one.choice.denied:
             continue
-        fault = axes.scale_fault(one.whole, one.single, least) if one.covered >= LEAST_SCALE_COVERAGE else None
+        fault = scale_fault(one.whole, one.single, least) if one.covered >= LEAST_SCALE_COVERAGE else None
         if fault is not None and one.explained >= 0.8:
             found.append((one, fault))
         elif one.whole.far_high - one.whole.far_low < 0.3:
@@ -190,7 +276,7 @@ def misread(
     elif choice.startswith(f"{frame} "):
         signs = choice.removeprefix(f"{frame} ")
         text = f"its components are {signs} of the {noun}"
-        factor = axes.sign_factor(signs)
+        factor = sign_factor(signs)
         fix = Fix("scale", (name,), factor) if factor else None
     else:
         text, fix = "it is not what it is declared to be, but which axes or frame it has cannot be told", None
@@ -221,16 +307,11 @@ def wrong_scale(
     if found is None:
         return []
     seen, fault, witnesses = found
-    numbers = {**seen.evidence(), **axes.numbers(seen.single)}
+    numbers = {**seen.evidence(), **slope_numbers(seen.single)}
     text = f"{name} is not the derivative of {seen.against}: {fault.text}."
     if witnesses < 2:
         return [Finding(check, Grade.DEGRADES, text, name, (), numbers, alone)]
     return [Finding(check, Grade.DEGRADES, text, name, (), numbers, agreed, Fix("scale", (name,), fault.repair))]
-
-
-def _ratio(y: Array, x: Array) -> float:
-    square = float((x * x).sum())
-    return float((x * y).sum()) / square if square > 0 else 1.0
 
 
 def _error(value: Array, block: NDArray[np.int64]) -> Array:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor import excitation
-from crazyem.doctor.envelope import sound_signal
 from crazyem.doctor.excitation import Steps
 from crazyem.doctor.kinematics import continuous
 from crazyem.doctor.regression import Fit, linear_fit
@@ -19,7 +18,7 @@ from crazyem.physics.effects.timing import INPUT_DELAY
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.airborne import Airtime
 from crazyem.recordings.finding import percent
-from crazyem.recordings.ordering import Array, held
+from crazyem.recordings.ordering import Array, held, sound_signal
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.thrust import UNKNOWN_VOLTAGE_ERROR, Inputs, inputs_of
 from crazyem.vehicle import GRAVITY, Vehicle
@@ -116,15 +115,16 @@ def _vertical(recording: Recording, air: Airtime) -> _Vertical | None:
     if velocity is not None:
         steps = excitation.steps_of(*_with_attitude(velocity, attitude), air)
         if steps is not None:
-            response, tilts = [], []
+            response = []
             for t, v in zip(steps.nodes, steps.values):
                 force = np.diff(v[:, :3], axis=0) / np.diff(t)[:, None] + np.array([0.0, 0.0, GRAVITY])
                 turned = rotation_matrix(_unit(0.5 * (v[1:, 3:] + v[:-1, 3:]))) if attitude is not None else np.eye(3)
                 response.append(np.sum(force * turned[..., :, 2], axis=1))
-                tilts.append(v[:, :2])
             if attitude is not None:
                 return _Vertical(steps, response, "velocity and attitude", 0.0)
-            return _Vertical(steps, response, "velocity, taken as upright", _lean(steps))
+            # without the tilt, the thrust is off by the mean square of horizontal acceleration over g
+            lean = [np.mean((_slow(t, v[:, :2]) / GRAVITY) ** 2) for t, v in zip(steps.nodes, steps.values)]
+            return _Vertical(steps, response, "velocity, taken as upright", 0.005 + float(np.max(lean)))
     force = sound_signal(recording, "specific_force")
     if force is not None:
         steps = excitation.steps_of(force[0], force[1], air)
@@ -159,12 +159,6 @@ def _mass(vertical: _Vertical | None, inputs: Inputs, *, tau: float, delay: floa
 def _thrust(vertical: _Vertical, inputs: Inputs, *, tau: float, delay: float) -> list[Array]:
     tau = tau if inputs.lagged else 0.0
     return [mean[:, 0] for mean, _, _ in excitation.lagged(inputs, vertical.steps, tau=tau, delay=delay)]
-
-
-def _lean(steps: Steps) -> float:
-    """Relative error of the thrust if the tilt is unknown, from the mean square of horizontal acceleration over g."""
-    squares = [np.mean((_slow(t, v[:, :2]) / GRAVITY) ** 2) for t, v in zip(steps.nodes, steps.values)]
-    return 0.005 + float(np.max(squares))
 
 
 def _slow(time: Array, velocity: Array) -> Array:

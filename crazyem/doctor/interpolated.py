@@ -6,12 +6,11 @@ high rates are nearly straight without interpolation. Then near misses are as fr
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
-from crazyem.doctor.streams import COMMAND_SIGNALS, cadence, graded, places, runs
-from crazyem.recordings.finding import Finding, Fix, Grade, percent
+from crazyem.doctor.streams import COMMAND_SIGNALS, cadence, graded, places
+from crazyem.recordings.finding import Finding, Fix, Grade, percent, runs_of
 from crazyem.recordings.ordering import Array, Flags, sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -20,15 +19,6 @@ NEAR_MISS_DEVIATION = 1e-3  # the same for a near miss
 LEAST_RESOLUTION_STEPS = 1000.0  # least change over two steps, in units of the resolution, for a judgement
 DEGRADING_INTERPOLATED_SHARE = 0.05  # share of samples that degrades results
 RESAMPLED_SHARE = 0.5  # share of the moving samples from which the whole signal counts as resampled from a slower one
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Straightness:
-    """(n,) flags of the samples of one signal."""
-
-    on: Flags  # the signal moves, and the sample lies on the line between its neighbours
-    near: Flags  # it almost does
-    bend: Flags  # the sample is off this line
 
 
 def check(recording: Recording) -> list[Finding]:
@@ -40,8 +30,9 @@ def check(recording: Recording) -> list[Finding]:
     return found
 
 
-def straightness(time: Array, value: Array) -> Straightness:
-    """Which samples lie on the line between their neighbours.
+def straightness(time: Array, value: Array) -> tuple[Flags, Flags, Flags]:
+    """(n,) True where the signal moves and a sample lies on the line between its neighbours; where it almost does;
+    where a sample is off this line.
 
     Args:
         time: (n,) s, increasing; may be uneven.
@@ -68,7 +59,7 @@ def straightness(time: Array, value: Array) -> Straightness:
     on &= (moving > 1) | (np.convolve(on, [1, 0, 1], "same") > 0)
     near = (moving > 0) & ~off_near & bend
     bend[[0, -1]] = False
-    return Straightness(on, near, bend)
+    return on, near, bend
 
 
 def _resolution(column: Array) -> float:
@@ -85,8 +76,8 @@ def _signal(name: str, array: SignalArray) -> Iterator[Finding]:
         time, value = time[rows], value[rows]
     if time.size < 8:
         return
-    line = straightness(time, value)
-    hits, misses = int(line.on.sum()), int(line.near.sum())
+    on, near, bend = straightness(time, value)
+    hits, misses = int(on.sum()), int(near.sum())
     # by chance, a smooth signal has nine near misses for every hit
     if hits < 2 or hits < 0.5 * misses:
         return
@@ -94,15 +85,15 @@ def _signal(name: str, array: SignalArray) -> Iterator[Finding]:
         return  # the reader has already marked this signal by its own rule
     present = sound_rows(value)
     share = hits / int(present.sum())
-    wide = np.convolve(line.on, [1, 1, 1], "same") > 0
-    spans = runs(wide)
+    wide = np.convolve(on, [1, 1, 1], "same") > 0
+    spans = runs_of(wide)
     lasting = float((time[spans[:, 1] - 1] - time[spans[:, 0]]).max())
-    moving = hits + int((line.bend & present).sum())
+    moving = hits + int((bend & present).sum())
     evidence = {"samples": hits, "share": share, "runs": len(spans), "longest_s": lasting}
-    fix = Fix("mark", (name,), rows=rows[line.on])
+    fix = Fix("mark", (name,), rows=rows[on])
     if hits > RESAMPLED_SHARE * moving:
         duration = float(time[-1] - time[0])
-        knots = runs(line.bend)
+        knots = runs_of(bend)
         beat = cadence(time[knots[:, 0]]).period if len(knots) else 0.0
         rate = 1.0 / beat if beat > 0 else len(knots) / max(duration, 1e-9)
         stored = (time.size - 1) / max(duration, 1e-9)

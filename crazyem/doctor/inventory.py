@@ -1,26 +1,129 @@
 """Contents of a recording: signals, clocks, origin, extremes of the motion, and what can be identified from it."""
 
-import math
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
 
-from crazyem.doctor.envelope import Envelope, envelope
 from crazyem.doctor.identifiability import Verdict, identifiability, replay_objection
-from crazyem.recordings.airborne import airtime
+from crazyem.doctor.kinematics import upright
+from crazyem.notebook import finite
+from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import percent
-from crazyem.recordings.ordering import sound_rows
-from crazyem.recordings.recording import Recording, SignalArray
+from crazyem.recordings.ordering import Array, sound_rows, sound_signal
+from crazyem.recordings.recording import Recording, SignalArray, about
 from crazyem.recordings.thrust import kind_objection, vehicle_for, weight_objection
 from crazyem.vehicle import Vehicle
 
+SATURATED_DUTY = 0.999  # duty from which a rotor is at its limit
+_SPEED_SPAN = 0.1  # s over which position is differenced where there is no velocity
 _MOST_ENTRIES = 12  # most entries of a section of metadata in the text
 _MOST_FLIGHTS = 4  # most flights in the text
 _MOST_SIGNALS = 16  # most signals in the text
 _LONGEST_TEXT = 120  # characters of a metadata value that are shown
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """Extremes of the airborne part; None where a signal is missing. SI, world z up, body FLU."""
+
+    airborne_s: float
+    judged_by: tuple[str, ...]
+    speed_max_m_s: float | None = None
+    speed_rms_m_s: float | None = None
+    speed_from: str = ""
+    tilt_max_deg: float | None = None
+    tilt_from: str = ""
+    body_rate_max_rad_s: tuple[float, float, float] | None = None
+    altitude_min_m: float | None = None
+    altitude_max_m: float | None = None
+    vertical_speed_min_m_s: float | None = None
+    vertical_speed_max_m_s: float | None = None
+    acceleration_max_m_s2: float | None = None
+    specific_force_min_m_s2: float | None = None
+    specific_force_max_m_s2: float | None = None
+    voltage_start_V: float | None = None
+    voltage_end_V: float | None = None
+    voltage_min_V: float | None = None
+    motor_command_max: float | None = None
+    motor_saturated_share: float | None = None
+    airborne_intervals_s: tuple[tuple[float, float], ...] = ()
+
+
+def envelope(recording: Recording, air: Airtime) -> Envelope:
+    """Extremes of the airborne part, of samples as measured: one outlier is enough to set an extreme."""
+    found = _speeds(recording, air)
+    for name, extremes in _EXTREMES.items():
+        value = _in_the_air(recording, name, air)
+        if value is not None and not (name == "euler" and "tilt_from" in found):
+            found |= extremes(value)
+        del value  # of a long flight, one signal at a time
+    return Envelope(air.seconds, air.judged_by, airborne_intervals_s=air.flown, **found)
+
+
+def _range(key: str, value: Array) -> dict[str, float]:
+    return {key.format("min"): float(value.min()), key.format("max"): float(value.max())}
+
+
+def _tilt(source: str, upright: Array) -> dict[str, Any]:
+    """From the cosines (n,) of the tilt."""
+    return {"tilt_from": source, "tilt_max_deg": float(np.degrees(np.arccos(np.clip(upright.min(), -1.0, 1.0))))}
+
+
+# Signal -> extremes of its samples in the air (n, c); Euler angles count where there is no quaternion.
+_EXTREMES: dict[str, Callable[[Array], dict[str, Any]]] = {
+    "attitude": lambda q: _tilt("attitude", upright(q)),
+    "euler": lambda angles: _tilt("euler", np.cos(angles[:, 0]) * np.cos(angles[:, 1])),
+    "body_rate": lambda rate: {"body_rate_max_rad_s": tuple(float(r) for r in np.abs(rate).max(axis=0))},
+    "position": lambda position: _range("altitude_{}_m", position[:, 2]),
+    "acceleration": lambda a: {"acceleration_max_m_s2": float(np.linalg.norm(a, axis=1).max())},
+    "specific_force": lambda force: _range("specific_force_{}_m_s2", np.linalg.norm(force, axis=1)),
+    "voltage": lambda volts: {
+        "voltage_start_V": float(volts[0, 0]),
+        "voltage_end_V": float(volts[-1, 0]),
+        "voltage_min_V": float(volts.min()),
+    },
+    "motor_command": lambda duty: {
+        "motor_command_max": float(duty.max()),
+        "motor_saturated_share": float((duty >= SATURATED_DUTY).any(axis=1).mean()),
+    },
+}
+
+
+def _in_the_air(recording: Recording, name: str, air: Airtime) -> Array | None:
+    """(n, c) sound samples of a signal in the air, None if there are none."""
+    found = sound_signal(recording, name)
+    if found is None:
+        return None
+    value = found[1][air.covers(found[0])]
+    return value if value.size else None
+
+
+def _speeds(recording: Recording, air: Airtime) -> dict[str, Any]:
+    """Extremes of the velocity in the air, or of differences of the position."""
+    source, velocity = "velocity", _in_the_air(recording, "velocity", air)
+    if velocity is None:
+        source, velocity = "position", _differences(recording, air)
+    if velocity is None:
+        return {}
+    norm = np.linalg.norm(velocity, axis=1)
+    extremes = {"speed_max_m_s": float(norm.max()), "speed_rms_m_s": float(np.sqrt(np.mean(norm**2)))}
+    return {"speed_from": source, **extremes, **_range("vertical_speed_{}_m_s", velocity[:, 2])}
+
+
+def _differences(recording: Recording, air: Airtime) -> Array | None:
+    """Velocity (n, 3) [m/s] in the air by differences of the position; None if there are none."""
+    found = sound_signal(recording, "position")
+    if found is None:
+        return None
+    time, position = found
+    row = np.searchsorted(time, time + _SPEED_SPAN)
+    later = np.minimum(row, time.size - 1)
+    span = time[later] - time
+    whole = (row < time.size) & air.covers(time) & air.covers(time[later]) & (span < 2.0 * _SPEED_SPAN)
+    return (position[later] - position)[whole] / span[whole, None] if whole.any() else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,46 +182,35 @@ class Inventory:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: units in the names of the keys, None where unknown."""
-        return {
-            "path": self.path,
-            "source": self.source,
-            "duration_s": self.duration_s,
-            "samples": self.samples,
-            "vehicle": self.vehicle,
-            "signals": [_listed(asdict(row)) for row in self.signals],
-            "clocks": [asdict(row) for row in self.clocks],
-            "metadata": {section: dict(values) for section, values in self.metadata.items()},
-            "events": dict(self.events),
-            "envelope": _listed(asdict(self.envelope)),
-            "identifiable": [asdict(verdict) for verdict in self.verdicts],
-            "kind": self.kind,
-            "objections": {
-                "kind": self.other_kind,
-                "weight": self.unlike,
-                "flight": self.on_the_ground,
-                "replay": self.no_replay,
-            },
-        }
+        objections = {"kind": "other_kind", "weight": "unlike", "flight": "on_the_ground", "replay": "no_replay"}
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in objections.values()}
+        values |= {key: [asdict(row) for row in values.pop(key)] for key in ("signals", "clocks")}
+        values["identifiable"] = [asdict(verdict) for verdict in values.pop("verdicts")]
+        values["envelope"] = asdict(self.envelope)
+        values["objections"] = {key: getattr(self, name) for key, name in objections.items()}
+        plain: dict[str, Any] = finite(values)
+        return plain
 
     def text(self, *, everything: bool = False) -> str:
         """A summary of at most 20 lines; with `everything`, then also metadata, clocks and all signals."""
         head = f"{self.path}: {self.source}, {self.duration_s:.2f} s, {self.samples} samples"
-        parts = [head, *self._vehicle_lines(), *_flight_lines(self.envelope, self.on_the_ground)]
+        kind = self.other_kind or (f"{self.kind}, by its autopilot" if self.kind else "")
+        remarks = [f"{what}: {text}" for what, text in (("vehicle", kind), ("weight", self.unlike)) if text]
+        parts = [head, *remarks, *_flight_lines(self.envelope, self.on_the_ground)]
         parts += [f"what it could identify, as vehicle {self.vehicle}:", *_verdict_lines(self.verdicts)]
         if self.no_replay and all(verdict.reason != self.no_replay for verdict in self.verdicts):
             parts.append(f"  crazyem replay cannot use it: {self.no_replay}")
         if not everything:
             return "\n".join([*parts, *_summary_lines(self.signals)])
-        parts += ["", *_metadata_lines(self.metadata), *_signal_lines(self.signals), *_clock_lines(self.clocks)]
+        parts += [
+            "",
+            *(_metadata_line(*section) for section in self.metadata.items()),
+            *_signal_lines(self.signals),
+            *map(_clock_line, self.clocks),
+        ]
         if self.events:
             parts.append("events: " + ", ".join(f"{count} {kind}" for kind, count in self.events.items()))
         return "\n".join(parts)
-
-    def _vehicle_lines(self) -> list[str]:
-        """Kind of vehicle, and reasons why the vehicle's models may not fit."""
-        kind = self.other_kind or (f"{self.kind}, by its autopilot" if self.kind else "")
-        lines = {f"vehicle: {kind}": kind, f"weight: {self.unlike}": self.unlike}
-        return [line for line, known in lines.items() if known]
 
 
 def inventory(recording: Recording, vehicle: Vehicle | None = None) -> Inventory:
@@ -158,12 +250,7 @@ def _row(name: str, array: SignalArray) -> SignalRow:
     bad = ~sound_rows(array.value)
     return SignalRow(
         name=name,
-        quantity=array.quantity,
-        unit=array.unit,
-        frame=array.frame,
-        clock=array.clock,
-        stream=array.stream,
-        source=array.source,
+        **about(array),
         samples=n,
         start_s=float(time.min()) if time.size else None,
         end_s=float(time.max()) if time.size else None,
@@ -211,25 +298,9 @@ def _short(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, str
     return kept
 
 
-def _listed(values: dict[str, Any]) -> dict[str, Any]:
-    """Values for JSON: tuples become lists, numbers that are not finite become None."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, tuple | list):
-            return [plain(item) for item in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return {key: plain(value) for key, value in values.items()}
-
-
-def _metadata_lines(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
-    lines = []
-    for section, values in metadata.items():
-        text = f"{len(values)} entries (--json shows them)"
-        if len(values) <= _MOST_ENTRIES:
-            text = ", ".join(f"{key} {value}" for key, value in values.items())
-        lines.append(f"  {section}: {text}")
-    return lines
+def _metadata_line(section: str, values: Mapping[str, str]) -> str:
+    entries = ", ".join(f"{key} {value}" for key, value in values.items())
+    return f"  {section}: {entries if len(values) <= _MOST_ENTRIES else f'{len(values)} entries (--json shows them)'}"
 
 
 def _signal_lines(rows: tuple[SignalRow, ...]) -> list[str]:
@@ -254,12 +325,9 @@ def _names(source: tuple[str, ...]) -> str:
     return source[0] if len(source) == 1 else f"{source[0]} .. {source[-1]}" if source else ""
 
 
-def _clock_lines(rows: tuple[ClockRow, ...]) -> list[str]:
-    lines = []
-    for row in rows:
-        drift = "" if row.against_host_ppm is None else f", {row.against_host_ppm:+.0f} ppm against the host"
-        lines.append(f"clock {row.name or 'unnamed'}: {row.start_s:.3f} to {row.end_s:.3f} s{drift}")
-    return lines
+def _clock_line(row: ClockRow) -> str:
+    drift = "" if row.against_host_ppm is None else f", {row.against_host_ppm:+.0f} ppm against the host"
+    return f"clock {row.name or 'unnamed'}: {row.start_s:.3f} to {row.end_s:.3f} s{drift}"
 
 
 def _flight_lines(e: Envelope, on_the_ground: str) -> list[str]:

@@ -2,30 +2,28 @@
 
 A relation between two signals, y = dx/dt, is tested after both sides, y and the difference of x, are convolved with the
 same smooth window. The window is a raised cosine of `width` seconds. It suppresses vibration, quantisation, jitter of
-stamps and white noise.
+stamps and white noise. The lag between two tracks is found to a fraction of a grid step, for any units and axes.
 """
 
-import weakref
-from collections import OrderedDict
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
+from crazyem.doctor.regression import jackknife_error
 from crazyem.physics.rotations import (
     quaternion_conjugate,
     quaternion_from_euler,
     quaternion_product,
     rotation_vector_from_quaternion,
 )
+from crazyem.recordings.ordering import Array, Flags
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.signals.sample import SIGNALS
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 GRID_STEP = 0.01  # s, of the grid
 LONGEST_GRID_SECONDS = 900.0  # s; of longer recordings only this part, about the middle, is used
@@ -60,9 +58,8 @@ def measurements(recording: Recording, quantity: str) -> dict[str, SignalArray]:
     return dict(sorted(found.items(), key=lambda item: (item[0] != quantity, item[0])))
 
 
-# Cache of the last results of `light`, valid while the arrays exist: seven checks use the same signals.
-_light: OrderedDict[tuple[int, int, str], tuple[weakref.ref[Any], weakref.ref[Any], SignalArray]] = OrderedDict()
-_CACHED_RECORDINGS = 32
+# results of `light` by array and quantity: seven checks use the same signals
+_light: WeakKeyDictionary[SignalArray, dict[str, SignalArray]] = WeakKeyDictionary()
 
 
 def light(array: SignalArray, quantity: str) -> SignalArray:
@@ -71,16 +68,10 @@ def light(array: SignalArray, quantity: str) -> SignalArray:
     Of samples with equal stamps the first is kept. At most `LONGEST_GRID_SECONDS` about the median stamp are kept; a
     few wrong stamps do not move the median. Angles are picked, not averaged, because they jump.
     """
-    key = (id(array.time), id(array.value), quantity)
-    known = _light.get(key)
-    if known is not None and known[0]() is array.time and known[1]() is array.value:
-        _light.move_to_end(key)
-        return known[2]
-    made = _lightened(array, quantity)
-    _light[key] = (weakref.ref(array.time), weakref.ref(array.value), made)
-    while len(_light) > _CACHED_RECORDINGS:
-        _light.popitem(last=False)
-    return made
+    known = _light.setdefault(array, {})
+    if quantity not in known:
+        known[quantity] = _lightened(array, quantity)
+    return known[quantity]
 
 
 def _lightened(array: SignalArray, quantity: str) -> SignalArray:
@@ -138,7 +129,7 @@ class Track:
     """Values (m, c) on a grid, and where they are valid (m,)."""
 
     value: Array
-    valid: Mask
+    valid: Flags
 
     def part(self, rows: slice) -> "Track":
         return Track(self.value[rows], self.valid[rows])
@@ -220,7 +211,7 @@ def difference(given: Track) -> Track:
     return Track(value, _inner(given.valid))
 
 
-def _inner(valid: Mask) -> Mask:
+def _inner(valid: Flags) -> Flags:
     """Where two neighbours on either side are valid, too."""
     out = np.zeros(valid.size, bool)
     if valid.size >= 5:
@@ -231,6 +222,12 @@ def _inner(valid: Mask) -> Mask:
 def turn(first: Array, second: Array) -> Array:
     """Rotation vectors (m, 3) [rad] of conj(first) * second, (m, 4) each."""
     return rotation_vector_from_quaternion(quaternion_product(quaternion_conjugate(first), second))
+
+
+def upright(q: Array) -> Array:
+    """(n,) cosine of the tilt, from quaternions (n, 4) x y z w of any length but zero."""
+    square = np.sum(q**2, axis=1)
+    return np.asarray(1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2) / np.where(square > 0.0, square, 1.0), float)
 
 
 def continuous(q: Array) -> Array:
@@ -254,7 +251,7 @@ def _cubic(time: Array, value: Array, at: Array, i: NDArray[np.int64]) -> Array:
     return np.asarray(ends + h * u * v * (v * slope[i] - u * slope[i + 1]), float)
 
 
-def _sound(array: SignalArray) -> Mask:
+def _sound(array: SignalArray) -> Flags:
     """(n,) samples that have a time and all components, with plausible sizes."""
     sound = np.isfinite(array.time)
     sound &= ~array.marked
@@ -276,3 +273,132 @@ def poses(recording: Recording) -> dict[str, SignalArray]:
         for name, array in measurements(recording, "euler").items()
         if np.nanmax(np.abs(array.value)) <= 7.0
     }
+
+
+LARGEST_LAG = 0.3  # s, largest lag of the search, on either side
+COARSE_LAG_STEP = 3  # grid steps between lags tried at first
+MOST_CORRELATION_ROWS = 4000  # most rows of the grid in a correlation
+JACKKNIFE_REACH = 6  # grid steps by which a lag may move, on either side, when a block is left out
+FEWEST_CORRELATION_ROWS = 45  # fewest rows of the grid in a correlation
+
+
+@dataclass(frozen=True, slots=True)
+class Delay:
+    """Lag of the second track behind the first."""
+
+    value: float  # s; positive where the second is late
+    explained: float  # share of the variance of the second track that the first explains at this lag
+    at_edge: bool  # the best lag is at the end of the range, so there is no maximum inside
+
+
+def delay(first: Track, second: Track, *, reach: float = LARGEST_LAG, mixed: bool = True) -> Delay | None:
+    """Lag of `second` behind `first`, (m, c) each; None if they have too few valid rows in common.
+
+    Args:
+        first, second: on one grid, smoothed with the same window.
+        reach: s, largest lag on either side.
+        mixed: explain each component of the second by all components of the first (any axes, signs and units); else
+            by the same component with a free factor.
+    """
+    most = round(reach / GRID_STEP)
+    steps = np.arange(-most, most + 1)
+    curve = np.full(steps.size, np.nan)
+    # a smoothed signal has no peak narrower than the window: every third lag finds the peak, its neighbours refine it
+    for k in range(0, steps.size, COARSE_LAG_STEP):
+        curve[k] = _explained(first, second, int(steps[k]), mixed)
+    if not np.isfinite(curve).any():
+        return None
+    near = int(np.nanargmax(curve))
+    for k in range(max(near - COARSE_LAG_STEP, 0), min(near + COARSE_LAG_STEP + 1, steps.size)):
+        curve[k] = _explained(first, second, int(steps[k]), mixed)
+    top = int(np.nanargmax(curve))
+    edge = top in (0, steps.size - 1) or not np.isfinite(curve[top - 1 : top + 2]).all()
+    place = float(steps[top])
+    if not edge:
+        place = place - 1.0 + _peak(curve[top - 1 : top + 2])
+    return Delay(place * GRID_STEP, float(curve[top]), edge)
+
+
+def _explained(first: Track, second: Track, steps: int, mixed: bool) -> float:
+    """Share of the variance of second(t) that first(t - steps) explains; NaN with too few common rows."""
+    x, y, _ = _common(first, second, steps)
+    count = len(x)
+    if count < FEWEST_CORRELATION_ROWS:
+        return math.nan
+    one = np.full(count, 1.0 / count)
+    mx, my = one @ x, one @ y
+    sxx = x.T @ x / count - np.outer(mx, mx)
+    sxy = x.T @ y / count - np.outer(mx, my)
+    syy = np.einsum("ij,ij->j", y, y) / count - my * my
+    whole = float(syy.sum())
+    if whole <= 0.0 or np.trace(sxx) <= 0.0:
+        return math.nan
+    if mixed:
+        sxx = sxx + np.eye(len(sxx)) * (1e-9 * np.trace(sxx))
+        got = float(np.einsum("ij,ij->", sxy, np.linalg.solve(sxx, sxy)))
+    else:
+        got = float((np.diag(sxy) ** 2 / np.maximum(np.diag(sxx), 1e-300)).sum())
+    return got / whole
+
+
+def _common(first: Track, second: Track, steps: int) -> tuple[Array, Array, NDArray[np.int64]]:
+    """first(t - steps) and second(t), (n, c) each, at every second valid row t or fewer, and these rows (n,)."""
+    n = len(first.value) - abs(steps)
+    a, b = max(0, -steps), max(0, steps)
+    stride = max(2, n // MOST_CORRELATION_ROWS)
+    good = first.valid[a : a + n : stride] & second.valid[b : b + n : stride]
+    x, y = first.value[a : a + n : stride][good], second.value[b : b + n : stride][good]
+    return x, y, np.arange(b, b + n, stride)[good]
+
+
+def spread(first: Track, second: Track, found: Delay, block_rows: int) -> tuple[float, int]:
+    """Standard error [s] of a lag by leaving out one block at a time (jackknife), and the number of blocks.
+
+    Args:
+        first, second, found: arguments and result of `delay`.
+        block_rows: grid steps of a block.
+    """
+    middle = round(found.value / GRID_STEP)
+    steps = np.arange(middle - JACKKNIFE_REACH, middle + JACKKNIFE_REACH + 1)
+    sums = np.array([_block_sums(first, second, int(k), block_rows) for k in steps])
+    used = sums[:, :, 0, 0].min(axis=0) > 0
+    sums = sums[:, used]
+    count = int(used.sum())
+    if count < 3:
+        return math.inf, count
+    total = sums.sum(axis=1)
+    peaks = np.array([_peak(_share(total - sums[:, b])) for b in range(count)]) * GRID_STEP
+    if peaks.min() <= 0.0 or peaks.max() >= 2 * JACKKNIFE_REACH * GRID_STEP:
+        return math.inf, count
+    return float(jackknife_error(peaks)), count
+
+
+def _block_sums(first: Track, second: Track, steps: int, block_rows: int) -> Array:
+    """(blocks, 6, c) sums of 1, x, y, xx, xy, yy of x = first(t - steps), y = second(t), by blocks of t."""
+    x, y, rows = _common(first, second, steps)
+    block, blocks = rows // block_rows, -(-len(first.value) // block_rows)
+    parts = (np.ones_like(x), x, y, x * x, x * y, y * y)
+    sums = [[np.bincount(block, weights=column, minlength=blocks) for column in part.T] for part in parts]
+    return np.array(sums).transpose(2, 0, 1)
+
+
+def _share(sums: Array) -> Array:
+    """Explained share at each lag, from (lags, 6, c) sums."""
+    n = np.maximum(sums[:, 0], 1.0)
+    mx, my = sums[:, 1] / n, sums[:, 2] / n
+    sxx, sxy, syy = sums[:, 3] / n - mx * mx, sums[:, 4] / n - mx * my, sums[:, 5] / n - my * my
+    # a variance this small is the rounding error of sums that cancel
+    still = (sxx <= 1e-12 * (sums[:, 3] / n)) | (syy <= 1e-12 * (sums[:, 5] / n))
+    got = np.where(still, 0.0, sxy**2 / np.where(still, 1.0, sxx)).sum(axis=1)
+    whole = np.where(still, 0.0, syy).sum(axis=1)
+    return np.asarray(np.where(whole > 0.0, got / np.where(whole > 0.0, whole, 1.0), 0.0), float)
+
+
+def _peak(curve: Array) -> float:
+    """Position of the maximum in samples, from a parabola through three samples."""
+    top = int(np.argmax(curve))
+    if top in (0, curve.size - 1):
+        return float(top)
+    left, middle, right = curve[top - 1 : top + 2]
+    bend = left - 2.0 * middle + right
+    return top + (0.5 * (left - right) / bend if bend < 0.0 else 0.0)

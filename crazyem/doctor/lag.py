@@ -9,28 +9,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.doctor.delays import LARGEST_LAG, delay, spread
-from crazyem.doctor.kinematics import (
-    GRID_STEP,
-    Grid,
-    Track,
-    Window,
-    difference,
-    grid_of,
-    measurements,
-    origin_of,
-    poses,
-    rate_of_attitude,
-    track,
-    width_for,
-)
+from crazyem.doctor import kinematics
 from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.ordering import Array
 from crazyem.recordings.recording import Recording, SignalArray
-
-Array = NDArray[np.float64]
 
 LAG_CONFIDENCE = 0.995  # one-sided confidence level of a significant lag
 REPORTED_LAG = 0.003  # s, smallest reported lag
@@ -48,8 +32,11 @@ UNSTEADY_SCATTER_RATIO = 2.5  # scatter of the windows over their standard error
 
 def check(recording: Recording) -> list[Finding]:
     """One finding for each stream (or origin within one) that is late or early against the stream of the first pose."""
-    pose = next(iter(poses(recording).items()), None)
-    movers = [*measurements(recording, "position").items(), *measurements(recording, "velocity").items()]
+    pose = next(iter(kinematics.poses(recording).items()), None)
+    movers = [
+        *kinematics.measurements(recording, "position").items(),
+        *kinematics.measurements(recording, "velocity").items(),
+    ]
     moving = next((mover for mover in movers if pose is None or _path(*mover) == _path(*pose)), None)
     reference = pose or moving
     if reference is None:
@@ -61,7 +48,7 @@ def check(recording: Recording) -> list[Finding]:
         against = pose if array.quantity in ("body_rate", "attitude") else moving
         if path == base or against is None:
             continue
-        lag = _lag(name, array, *against)
+        lag = _fit(name, array, *against)
         if lag is not None and (path not in best or lag.error < best[path].error):
             best[path] = lag
     found = [_judge(recording, base, path, lag) for path, lag in best.items()]
@@ -102,7 +89,7 @@ _Path = tuple[str, str]
 
 
 def _path(name: str, array: SignalArray) -> _Path:
-    return array.stream or name, origin_of(name)
+    return array.stream or name, kinematics.origin_of(name)
 
 
 def _said(path: _Path, base: _Path) -> str:
@@ -112,45 +99,44 @@ def _said(path: _Path, base: _Path) -> str:
 
 def _comparable(recording: Recording) -> list[tuple[str, SignalArray]]:
     """Signals to compare; a velocity (which may come from a filter) only if its origin has no position."""
-    positions = measurements(recording, "position")
-    placed = {origin_of(name) for name in positions}
-    velocities = measurements(recording, "velocity")
+    positions = kinematics.measurements(recording, "position")
+    placed = {kinematics.origin_of(name) for name in positions}
+    velocities = kinematics.measurements(recording, "velocity")
     return [
-        *measurements(recording, "body_rate").items(),
-        *measurements(recording, "attitude").items(),
+        *kinematics.measurements(recording, "body_rate").items(),
+        *kinematics.measurements(recording, "attitude").items(),
         *positions.items(),
-        *((name, array) for name, array in velocities.items() if origin_of(name) not in placed),
+        *((name, array) for name, array in velocities.items() if kinematics.origin_of(name) not in placed),
     ]
 
 
-def _lag(name: str, array: SignalArray, against: str, other: SignalArray) -> _Lag | None:
-    grid = grid_of(array, other)
-    if grid.size * GRID_STEP < WINDOW_SECONDS * FEWEST_WINDOWS / 2:
-        return None
-    window = Window(max(0.3 if other.quantity == "attitude" else 0.2, width_for(array, other)))
-    return _fit(name, against, window.mean(_speed(other, grid)), window.mean(_speed(array, grid)), grid, window.width)
-
-
-def _speed(array: SignalArray, grid: Grid) -> Track:
-    given = track(array, grid, bridge=LAG_BRIDGED_SECONDS)
+def _speed(array: SignalArray, grid: kinematics.Grid) -> kinematics.Track:
+    given = kinematics.track(array, grid, bridge=LAG_BRIDGED_SECONDS)
     if array.quantity == "attitude":
-        return rate_of_attitude(given)
-    return difference(given) if array.quantity == "position" else given
+        return kinematics.rate_of_attitude(given)
+    return kinematics.difference(given) if array.quantity == "position" else given
 
 
-def _fit(name: str, against: str, first: Track, second: Track, grid: Grid, width: float) -> _Lag | None:
-    whole = delay(first, second, mixed=False)
+def _fit(name: str, array: SignalArray, against: str, other: SignalArray) -> _Lag | None:
+    grid = kinematics.grid_of(array, other)
+    if grid.size * kinematics.GRID_STEP < WINDOW_SECONDS * FEWEST_WINDOWS / 2:
+        return None
+    window = kinematics.Window(max(0.3 if other.quantity == "attitude" else 0.2, kinematics.width_for(array, other)))
+    first, second, width = window.mean(_speed(other, grid)), window.mean(_speed(array, grid)), window.width
+    whole = kinematics.delay(first, second, mixed=False)
     if whole is None or whole.at_edge or whole.explained < LEAST_WINDOW_SHARE:
         return None
-    size = round(max(WINDOW_SECONDS, grid.size * GRID_STEP / MOST_WINDOWS) / GRID_STEP)
-    error, count = spread(first, second, whole, size // 2)
+    size = round(max(WINDOW_SECONDS, grid.size * kinematics.GRID_STEP / MOST_WINDOWS) / kinematics.GRID_STEP)
+    error, count = kinematics.spread(first, second, whole, size // 2)
     error = max(error, _error(first, second, whole.value, whole.explained, width))
     if count < FEWEST_WINDOWS or not error < math.inf:
         return None
     found = []
     for first_row in range(0, grid.size - size // 2, size):
         rows = slice(first_row, first_row + size)
-        one = delay(first.part(rows), second.part(rows), reach=min(LARGEST_LAG, abs(whole.value) + 0.15), mixed=False)
+        one = kinematics.delay(
+            first.part(rows), second.part(rows), reach=min(kinematics.LARGEST_LAG, abs(whole.value) + 0.15), mixed=False
+        )
         if one is None or one.at_edge or one.explained < LEAST_WINDOW_SHARE:
             continue
         rough = _error(first.part(rows), second.part(rows), one.value, one.explained, width)
@@ -165,18 +151,16 @@ def _changes(found: Array, start: float, end: float) -> _Changes:
     """Changes of the lag, from windows (n, 3) of time, lag, standard error."""
     t, y, e = found.T
     middle = _weighted_median(y, 1.0 / e)
-    ramp = _ramp(t, y)
+    i, j = np.triu_indices(t.size, 1)
+    ramp = float(np.median((y[j] - y[i]) / (t[j] - t[i])))  # median of the slopes of all pairs (Theil and Sen)
     line = _weighted_median(y - ramp * (t - t.mean()), 1.0 / e)
     rest = y - line - ramp * (t - t.mean())
+    error = max(_robust(rest), LEAST_SCATTER_RATIO * float(np.median(e)))
     return _Changes(
         start=line + ramp * (start - float(t.mean())),
         end=line + ramp * (end - float(t.mean())),
         drift=ramp * (end - start),
-        drift_error=1.25
-        * max(_robust(rest), LEAST_SCATTER_RATIO * float(np.median(e)))
-        / math.sqrt(t.size)
-        / float(t.std())
-        * (end - start),
+        drift_error=1.25 * error / math.sqrt(t.size) / float(t.std()) * (end - start),
         scatter=_robust((y - middle) / e),
         about_line=_robust(rest / e),
         low=float(np.quantile(y, 0.1)),
@@ -185,38 +169,32 @@ def _changes(found: Array, start: float, end: float) -> _Changes:
     )
 
 
-def _error(first: Track, second: Track, lag: float, explained: float, width: float) -> float:
+def _error(first: kinematics.Track, second: kinematics.Track, lag: float, explained: float, width: float) -> float:
     """Standard error [s] of a lag, from the unexplained variance and the frequency of the common part.
 
     The mean square frequency of the common part is the covariance of the derivatives over that of the signals; noise of
     either signal does not change it. One sample per window width counts as independent.
     """
-    steps = round(lag / GRID_STEP)
+    steps = round(lag / kinematics.GRID_STEP)
     n = len(first.value) - abs(steps)
     x, y = first.value[max(0, -steps) :][:n], second.value[max(0, steps) :][:n]
     good = first.valid[max(0, -steps) :][:n] & second.valid[max(0, steps) :][:n]
     both = good[1:] & good[:-1]
     if both.sum() < 10:
         return math.inf
-    dx, dy = np.diff(x, axis=0)[both] / GRID_STEP, np.diff(y, axis=0)[both] / GRID_STEP
+    dx, dy = np.diff(x, axis=0)[both] / kinematics.GRID_STEP, np.diff(y, axis=0)[both] / kinematics.GRID_STEP
     x, y = x[good] - x[good].mean(axis=0), y[good] - y[good].mean(axis=0)
     common = float((x * y).mean(axis=0) @ (x * y).mean(axis=0))
     moving = float((dx * dy).mean(axis=0) @ (x * y).mean(axis=0))
     if common <= 0.0 or moving <= 0.0:
         return math.inf
-    independent = max(good.sum() * GRID_STEP / width, 1.0)
+    independent = max(good.sum() * kinematics.GRID_STEP / width, 1.0)
     return max(SMALLEST_WINDOW_ERROR, math.sqrt(max(1.0 - explained, 0.0) / explained * common / moving / independent))
 
 
 def _robust(rest: Array) -> float:
     """Standard deviation by the median of absolute values."""
     return 1.4826 * float(np.median(np.abs(rest)))
-
-
-def _ramp(t: Array, y: Array) -> float:
-    """Median of the slopes of all pairs (Theil and Sen), which is robust against outliers."""
-    i, j = np.triu_indices(t.size, 1)
-    return float(np.median((y[j] - y[i]) / (t[j] - t[i])))
 
 
 def _weighted_median(y: Array, w: Array) -> float:

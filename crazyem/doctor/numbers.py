@@ -77,13 +77,6 @@ def _unit_of_motors(array: SignalArray, values: Array) -> str:
     return ""
 
 
-def _unconnected(name: str, array: SignalArray) -> Finding:
-    sensor = ZERO_WITHOUT_SENSOR[array.quantity]
-    text = f"{name} reads 0 in all of its {array.time.size} samples: no {sensor} is connected, {name} is not measured."
-    evidence = {"samples": array.time.size}
-    return Finding("numbers", Grade.HARMLESS, text, name, (), evidence, "Nothing to do, unless you expected it.")
-
-
 def check(recording: Recording) -> list[Finding]:
     """Findings about NaN and infinities of the file itself, impossible values and jumps, stamps that are no numbers."""
     found: list[Finding] = []
@@ -91,7 +84,12 @@ def check(recording: Recording) -> list[Finding]:
     for name, array in recording.signals.items():
         if array.time.size == 0:
             continue
-        found += _stamps(name, array)
+        lost = ~np.isfinite(array.time)
+        if lost.any():
+            text = f"{name} has {int(lost.sum())} samples whose stamp is not a number."
+            evidence = {"samples": int(lost.sum()), "share": float(lost.mean())}
+            advice = "Remove these rows from the source; a sample without a time says nothing."
+            found.append(Finding("numbers", Grade.UNUSABLE, text, name, (), evidence, advice))
         sound = sound_rows(array.value)
         bad = ~sound & ~array.marked
         if bad.any():
@@ -109,16 +107,6 @@ def check(recording: Recording) -> list[Finding]:
         evidence = {"columns": len(unmapped), "samples": sum(unmapped.values())}
         found.append(Finding("numbers", Grade.HARMLESS, text, "", (), evidence))
     return found
-
-
-def _stamps(name: str, array: SignalArray) -> Iterator[Finding]:
-    bad = ~np.isfinite(array.time)
-    if not bad.any():
-        return
-    text = f"{name} has {int(bad.sum())} samples whose stamp is not a number."
-    evidence = {"samples": int(bad.sum()), "share": float(bad.mean())}
-    advice = "Remove these rows from the source; a sample without a time says nothing."
-    yield Finding("numbers", Grade.UNUSABLE, text, name, (), evidence, advice)
 
 
 def _not_numbers(name: str, array: SignalArray, bad: Flags) -> Finding:
@@ -143,7 +131,10 @@ def _impossible(name: str, array: SignalArray, limit: Limit, sound: Flags) -> It
     if not bad.any():
         return
     if array.quantity in ZERO_WITHOUT_SENSOR and not array.value[sound].any():
-        yield _unconnected(name, array)
+        sensor, samples = ZERO_WITHOUT_SENSOR[array.quantity], array.time.size
+        text = f"{name} reads 0 in all of its {samples} samples: no {sensor} is connected, {name} is not measured."
+        advice = "Nothing to do, unless you expected it."
+        yield Finding("numbers", Grade.HARMLESS, text, name, (), {"samples": samples}, advice)
         return
     share = float(bad.mean())
     good = measure[sound & ~bad]
@@ -169,7 +160,7 @@ def _impossible(name: str, array: SignalArray, limit: Limit, sound: Flags) -> It
 LEAST_JUMP = 0.1  # m, least deviation of a step from the motion around it: ten times a step at 100 Hz and 1 m/s
 CRASH_ACCELERATION = 100.0  # m/s^2 of a crash: limits the deviation of a step that is still possible
 JUMP_NOISE_RATIO = 12.0  # least deviation of a step, over the median deviation
-MEDIAN_STEPS = 5  # steps on each side; their median is the motion
+MEDIAN_STEPS = 5  # steps on each side
 RETURN_SECONDS = 0.5  # s, longest time until a jump back
 COARSE_RESOLUTION = 0.005  # m; a coarser one gives a velocity over 0.1 s to no better than 5 cm/s
 _FEWEST_SAMPLES = 50
@@ -186,19 +177,14 @@ def _position(name: str, array: SignalArray) -> list[Finding]:
         return []
     steps = np.diff(time)
     velocity = np.diff(value, axis=0) / steps[:, None]
-    expected = _neighbour_velocity(velocity)
-    off = np.linalg.norm(velocity - expected, axis=1) * steps
+    # the motion: the median velocity of each step and `MEDIAN_STEPS` steps on either side
+    padded = np.pad(velocity, ((MEDIAN_STEPS, MEDIAN_STEPS), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * MEDIAN_STEPS + 1, axis=0)
+    off = np.linalg.norm(velocity - np.median(windows, axis=2), axis=1) * steps
     usual = float(np.median(off))
     limit = np.maximum(np.maximum(LEAST_JUMP, JUMP_NOISE_RATIO * usual), 0.5 * CRASH_ACCELERATION * steps**2)
     rows = np.flatnonzero((off > limit) & (steps < RETURN_SECONDS))
     return [*_found(name, array, sound, time, value, rows, off), *_coarse(name, array, value)]
-
-
-def _neighbour_velocity(velocity: Array) -> Array:
-    """(n, 3) the median velocity of each step and `MEDIAN_STEPS` steps on either side."""
-    padded = np.pad(velocity, ((MEDIAN_STEPS, MEDIAN_STEPS), (0, 0)), mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * MEDIAN_STEPS + 1, axis=0)
-    return np.median(windows, axis=2)
 
 
 def _found(

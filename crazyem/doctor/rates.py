@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 
-from crazyem.doctor import axes
-from crazyem.doctor.hypotheses import Comparison, compare_hypotheses, misread, wrong_scale, wrong_unit
+from crazyem.doctor.hypotheses import Comparison, compare_hypotheses, known_factor, misread, wrong_scale, wrong_unit
 from crazyem.doctor.kinematics import Track, grid_of, measurements, poses, rate_of_attitude, track, width_for
 from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Fix, Grade
@@ -64,7 +63,7 @@ def _judge(name: str, looks: list[Comparison]) -> list[Finding]:
         return []
     if best.choice.denied:
         return [misread("rates", name, best, _MISREAD, noun="body rate", fix=Fix("world_to_body", (name,)))]
-    unit = axes.known_factor(whole, {"deg/s": DEGREES, "converted": 1.0 / DEGREES})
+    unit = known_factor(whole, {"deg/s": DEGREES, "converted": 1.0 / DEGREES})
     if unit:
         text = f"{name} is {whole.value:.4g} times the derivative of {best.against}: {_UNITS[unit[0]]}."
         advice = "Multiply it by the factor of the fix, or correct its unit where it is read."

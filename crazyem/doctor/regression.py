@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
-Array = NDArray[np.float64]
+from crazyem.recordings.ordering import Array
 
 BLOCK_SECONDS = 1.5  # s
 MOST_BLOCKS = 60  # most blocks; long recordings have longer blocks
@@ -272,7 +272,9 @@ def _linear_fit_once(response: list[Array], columns: list[Array], share: float) 
     left = z - f @ (theta * scale)
     variance = float(left @ left) / max(z.size - width, 1)
     covariance = np.linalg.inv(f.T @ f) * variance
-    inflation = _inflation(f * left[:, None], covariance)
+    scaled = f * left[:, None] @ covariance
+    plain = np.sum(scaled**2, axis=0)
+    inflation = np.sqrt(np.maximum(long_run(scaled) / np.where(plain > 0.0, plain, 1.0), 1.0))
     return Fit(theta, np.sqrt(np.diag(covariance)) / scale * inflation * math.sqrt(share), np.zeros(width))
 
 
@@ -297,12 +299,6 @@ def filtered(weights: Array, part: Array) -> Array:
     if part.ndim == 1:
         return np.convolve(weights, part)[AUTOREGRESSION_ORDER : part.size]
     return np.column_stack([np.convolve(weights, column)[AUTOREGRESSION_ORDER : column.size] for column in part.T])
-
-
-def _inflation(terms: Array, covariance: Array) -> Array:
-    scaled = terms @ covariance
-    plain = np.sum(scaled**2, axis=0)
-    return np.sqrt(np.maximum(long_run(scaled) / np.where(plain > 0.0, plain, 1.0), 1.0))
 
 
 def long_run(terms: Array) -> Array:

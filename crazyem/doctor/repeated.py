@@ -6,9 +6,9 @@ small as a few resolutions. Coarse signals that repeat together with a fine one 
 
 import numpy as np
 
-from crazyem.doctor.streams import COMMAND_SIGNALS, Stream, cadence, listed, places, runs, same_as_before, sole, streams
+from crazyem.doctor.streams import COMMAND_SIGNALS, Stream, cadence, listed, places, same_as_before, sole, streams
 from crazyem.recordings.airborne import Airtime, airtime
-from crazyem.recordings.finding import Finding, Fix, Grade, percent
+from crazyem.recordings.finding import Finding, Fix, Grade, percent, runs_of
 from crazyem.recordings.ordering import Array, Flags, inside, sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -43,7 +43,11 @@ def _stream(stream: Stream, flight: Airtime) -> list[Finding]:
         flags = same_as_before(array.value) & considered & ~_resting(array)
         beat = _hold(flags, considered & sound_rows(array.value)) if array.quantity in _SLOW_SIGNALS else None
         if beat is not None and flags.sum() >= 0.3 * considered.sum() and not _creeps(array):
-            found.append(_held_finding(name, float(flags[considered].mean()), 1.0 / stored, beat))
+            rate = 1.0 / stored / beat
+            text = f"{name} is measured at about {rate:.0f} Hz and held in between (stored at {1.0 / stored:.0f} Hz)."
+            evidence = {"share": float(flags[considered].mean()), "rate_hz": rate, "stored_hz": 1.0 / stored}
+            advice = "Count it at its real rate."
+            found.append(Finding("repeated", Grade.HARMLESS, text, name, (), evidence, advice))
             continue
         same[name] = flags
         if _is_fine(array, considered):
@@ -122,19 +126,12 @@ def _creeps(array: SignalArray) -> bool:
     return steps.size < 10 or bool((steps <= 1.5 * steps.min()).mean() > 0.6)
 
 
-def _held_finding(name: str, share: float, stored: float, beat: float) -> Finding:
-    rate = stored / beat
-    text = f"{name} is measured at about {rate:.0f} Hz and held in between (stored at {stored:.0f} Hz)."
-    evidence = {"share": share, "rate_hz": rate, "stored_hz": stored}
-    return Finding("repeated", Grade.HARMLESS, text, name, (), evidence, "Count it at its real rate.")
-
-
 def _finding(
     names: list[str], time: Array, rows: Flags, considered: Flags, stored: float, *, whole_table: bool
 ) -> Finding:
     share = float(rows[considered].mean())
     rate = stored * (1.0 - share)
-    lengths = np.diff(runs(rows), axis=1)
+    lengths = np.diff(runs_of(rows), axis=1)
     what = "whole rows" if whole_table else "values"
     text = (
         f"{percent(share)} of the {what} of {listed(names)} in flight repeat the one before: "

@@ -7,14 +7,13 @@ Dropouts to zero are searched as well: a sensor that misses every second pulse o
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import cadence, listed, longest, runs
+from crazyem.doctor.streams import cadence, listed, longest
 from crazyem.recordings.airborne import airtime
-from crazyem.recordings.finding import Finding, Fix, Grade, intervals_of, percent
+from crazyem.recordings.finding import Finding, Fix, Grade, intervals_of, percent, runs_of
 from crazyem.recordings.ordering import Array, Flags, Intervals, inside, ordered
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -126,13 +125,9 @@ def _from_the_others(speed: Array) -> Array | None:
     return expected
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Jumps:
-    """The known samples of a rotor."""
-
-    rows: NDArray[np.int64]  # (k,) their row numbers
-    ratio: Array  # (k,) speed over expected speed
-    leap: Array  # (k - 1,) speed over the speed of the sample before; NaN across a gap
+# the known samples of a rotor: (k,) row numbers, (k,) speed over expected speed, (k - 1,) speed over the speed of the
+# sample before, NaN across a gap
+_Jumps = tuple[NDArray[np.int64], Array, Array]
 
 
 def _jumps(time: Array, speed: Array, ratio: Array, rows: Flags) -> _Jumps | None:
@@ -142,16 +137,17 @@ def _jumps(time: Array, speed: Array, ratio: Array, rows: Flags) -> _Jumps | Non
         return None
     leap = speed[known[1:]] / speed[known[:-1]]
     leap[np.diff(time[known]) > 3.5 * float(np.median(np.diff(time)))] = np.nan
-    return _Jumps(known, ratio[known], leap) if ((leap < 0.6) | (leap > 1.7)).any() else None
+    return (known, ratio[known], leap) if ((leap < 0.6) | (leap > 1.7)).any() else None
 
 
 def _between(jumps: _Jumps, fraction: float) -> NDArray[np.int64]:
     """Rows of stretches at a fraction of the expected speed that begin and end with a jump."""
-    starts = np.flatnonzero(np.abs(jumps.leap / fraction - 1.0) < JUMP_TOLERANCE)
-    ends = np.flatnonzero(np.abs(jumps.leap * fraction - 1.0) < JUMP_TOLERANCE)
-    near = np.abs(jumps.ratio / fraction - 1.0) < SPEED_TOLERANCE
-    normal = np.abs(jumps.ratio - 1.0) < SPEED_TOLERANCE
-    last = jumps.rows.size - 1
+    rows, ratio, leap = jumps
+    starts = np.flatnonzero(np.abs(leap / fraction - 1.0) < JUMP_TOLERANCE)
+    ends = np.flatnonzero(np.abs(leap * fraction - 1.0) < JUMP_TOLERANCE)
+    near = np.abs(ratio / fraction - 1.0) < SPEED_TOLERANCE
+    normal = np.abs(ratio - 1.0) < SPEED_TOLERANCE
+    last = rows.size - 1
     found = [np.empty(0, np.int64)]
     after = 0
     for start in starts[:_MOST_JUMPS]:
@@ -161,7 +157,7 @@ def _between(jumps: _Jumps, fraction: float) -> NDArray[np.int64]:
         # up to the jump back, or to the end of the flight
         end = int(ends[place]) if place < ends.size else last
         if near[start + 1 : end + 1].mean() > 0.8 and (place == ends.size or normal[min(end + 1, last)]):
-            found.append(jumps.rows[start + 1 : end + 1])
+            found.append(rows[start + 1 : end + 1])
             after = end + 1
     return np.concatenate(found)
 
@@ -174,7 +170,7 @@ def _stopped(ratio: Array, rows: Flags) -> Flags:
     flags = np.zeros(ratio.size, bool)
     known = np.flatnonzero(np.isfinite(ratio))
     low = ratio[known] < STOPPED_RATIO
-    for first, last in runs(low):
+    for first, last in runs_of(low):
         neighbours = [k for k in (first - 1, last) if 0 <= k < known.size]
         if (ratio[known[neighbours]] > 0.5).any():
             flags[known[first:last]] = True

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from crazyem.doctor.streams import longest, runs
+from crazyem.doctor.streams import longest
 from crazyem.recordings.airborne import Airtime, airtime
-from crazyem.recordings.finding import Finding, Grade, intervals_of, percent
-from crazyem.recordings.ordering import Array, Flags, Intervals, inside, ordered
+from crazyem.recordings.finding import Finding, Grade, intervals_of, percent, runs_of
+from crazyem.recordings.ordering import Array, Flags, Intervals, inside, ordered, sound_signal
 from crazyem.recordings.recording import Recording
 
 FULL_DUTY = 0.999  # share of the largest duty that counts as full
@@ -80,7 +80,7 @@ def _is_ceiling(column: Array, top: float, rows: Flags) -> bool:
     """True if the largest value is a limit: too frequent, and too long at a time, for a maximum of a coarse signal."""
     at_top = (column == top) & rows
     count = int(at_top.sum())
-    spans = runs(at_top)
+    spans = runs_of(at_top)
     below = int(((column < top) & (column >= 0.97 * top) & rows).sum())
     often = count >= max(10, 0.002 * rows.sum()) and count > 0.5 * below
     return often and bool((spans[:, 1] - spans[:, 0]).max() >= _CEILING_RUN)
@@ -116,6 +116,7 @@ def _lower(name: str, time: Array, value: Array, rows: Flags, flight: Airtime) -
 
 def _voltage(recording: Recording, times: Array) -> float:
     """Median voltage at these times; NaN without a voltage."""
-    array = recording.signals.get("voltage")
-    time, value = ordered(array) if array is not None else (np.empty(0), np.empty((0, 1)))
-    return float(np.median(np.interp(times, time, value[:, 0]))) if time.size >= 2 else math.nan
+    found = sound_signal(recording, "voltage")
+    if found is None or found[0].size < 2:
+        return math.nan
+    return float(np.median(np.interp(times, found[0], found[1][:, 0])))

@@ -135,11 +135,6 @@ def _refined(time: NDArray[np.float64], period: float) -> float:
     return float(np.median(spans / count[count >= 8])) if spans.size else period
 
 
-def runs(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """(k, 2) first row and row after the last of each run of True in (n,) flags."""
-    return np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)
-
-
 def longest(intervals: Iterable[tuple[float, float]]) -> Intervals:
     """The longest `MOST_INTERVALS`, in order of time."""
     spans = [(float(min(a, b)), float(max(a, b))) for a, b in intervals if math.isfinite(a) and math.isfinite(b)]

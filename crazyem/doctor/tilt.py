@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.doctor.delays import delay
 from crazyem.doctor.kinematics import (
     GRAVITY,
     UP,
     Grid,
     Track,
     Window,
+    delay,
     difference,
     grid_of,
     measurements,
@@ -30,9 +30,8 @@ from crazyem.doctor.kinematics import (
 from crazyem.doctor.regression import FEWEST_BLOCKS, SLOPE_CONFIDENCE, blocks, jackknife_error
 from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Grade
+from crazyem.recordings.ordering import Array
 from crazyem.recordings.recording import Recording, SignalArray
-
-Array = NDArray[np.float64]
 
 REPORTED_TILT = math.radians(0.5)  # smallest reported tilt
 DEGRADING_TILT = math.radians(1.5)  # tilt that degrades results
@@ -52,7 +51,9 @@ def check(recording: Recording) -> list[Finding]:
 
 
 def _look(recording: Recording, pose: str, turning: SignalArray, name: str, array: SignalArray) -> Finding | None:
-    moving = _velocity(recording, pose)
+    # the velocity of the pose's origin, else the first velocity
+    velocities = sorted(measurements(recording, "velocity").items(), key=lambda v: origin_of(v[0]) != origin_of(pose))
+    moving = [velocity for _, velocity in velocities[:1]]
     grid = grid_of(array, turning, *moving)
     attitude = track(turning, grid)
     world = _residual(recording, attitude, array, moving, grid, max(0.5, width_for(array, turning)))
@@ -69,16 +70,12 @@ def _look(recording: Recording, pose: str, turning: SignalArray, name: str, arra
         return None
     design = _design(q, both=True)
     both, spread = _jackknife(design, e, block)
-    if not _separable(design):
+    # tilt and bias are separate only if the heading changes enough
+    flat = design.reshape(-1, design.shape[2])
+    flat = flat / np.linalg.norm(flat, axis=0)
+    if float(np.linalg.eigvalsh(flat.T @ flat)[0]) <= SMALLEST_EIGENVALUE:
         spread = np.full_like(spread, np.inf)
     return _judge(pose, name, both, spread, _jackknife(_design(q, both=False), e, block), count)
-
-
-def _velocity(recording: Recording, pose: str) -> list[SignalArray]:
-    """The velocity of the pose's origin, else the first velocity; empty if there is none."""
-    found = measurements(recording, "velocity")
-    same = [array for name, array in found.items() if origin_of(name) == origin_of(pose)]
-    return [*same, *found.values()][:1]
 
 
 def _residual(
@@ -113,13 +110,6 @@ def _design(q: Array, *, both: bool) -> Array:
     for k, axis in enumerate((0, 1, 2) if both else (2,)):
         a[:, :, 2 + k] = rotate(q, np.tile(np.eye(3)[axis], (n, 1)))
     return a
-
-
-def _separable(a: Array) -> bool:
-    """True if the heading changes enough to separate tilt and bias."""
-    flat = a.reshape(-1, a.shape[2])
-    flat = flat / np.linalg.norm(flat, axis=0)
-    return float(np.linalg.eigvalsh(flat.T @ flat)[0]) > SMALLEST_EIGENVALUE
 
 
 def _jackknife(a: Array, e: Array, block: NDArray[np.int64]) -> tuple[Array, Array]:

@@ -1,7 +1,6 @@
 """Check: velocity against the derivative of position, and positions of two origins: unit, frame, sign, scale."""
 
-from crazyem.doctor import axes
-from crazyem.doctor.hypotheses import Comparison, agreed_scale, compare_hypotheses, misread, wrong_scale, wrong_unit
+from crazyem.doctor import hypotheses
 from crazyem.doctor.kinematics import Track, difference, grid_of, measurements, poses, track, width_for
 from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Grade
@@ -30,13 +29,19 @@ def check(recording: Recording) -> list[Finding]:
     first = next(iter(positions), "")
     for name, array in positions.items():
         if name not in (first, *blamed) and first not in blamed:
-            seen = _compare_positions(array, first, positions[first])
+            # positions, not their derivatives: late packets distort the scale of a derivative
+            grid = grid_of(array, positions[first])
+            candidates = {"world": (0, track(positions[first], grid))}
+            width = max(VELOCITY_WINDOW, width_for(array, positions[first]))
+            seen = hypotheses.compare_hypotheses(array, grid, first, candidates, width=width, least=LEAST_POSITION_RMS)
             if seen is not None:
-                found += _judge_position(name, seen, blamed)
+                found += _judge(name, [seen], blamed, derived=False)
     return found
 
 
-def _compare(array: SignalArray, other: str, reference: SignalArray, attitudes: list[SignalArray]) -> Comparison | None:
+def _compare(
+    array: SignalArray, other: str, reference: SignalArray, attitudes: list[SignalArray]
+) -> hypotheses.Comparison | None:
     grid = grid_of(array, reference, *attitudes)
     world = difference(track(reference, grid))
     candidates: dict[str, tuple[int, Track]] = {"world": (0, world)}
@@ -45,68 +50,47 @@ def _compare(array: SignalArray, other: str, reference: SignalArray, attitudes: 
         turned = rotate(attitude.value, world.value, inverse=True)
         candidates["body"] = (1, Track(turned, world.valid & attitude.valid))
     width = max(VELOCITY_WINDOW, width_for(array, reference))
-    return compare_hypotheses(array, grid, other, candidates, width=width, least=LEAST_VELOCITY_RMS, offset=False)
+    return hypotheses.compare_hypotheses(
+        array, grid, other, candidates, width=width, least=LEAST_VELOCITY_RMS, offset=False
+    )
 
 
-def _compare_positions(array: SignalArray, other: str, reference: SignalArray) -> Comparison | None:
-    """Comparison of positions, not of their derivatives: late packets distort the scale of a derivative."""
-    grid = grid_of(array, reference)
-    candidates = {"world": (0, track(reference, grid))}
-    width = max(VELOCITY_WINDOW, width_for(array, reference))
-    return compare_hypotheses(array, grid, other, candidates, width=width, least=LEAST_POSITION_RMS)
+def _judge(name: str, looks: list[hypotheses.Comparison], blamed: set[str], *, derived: bool = True) -> list[Finding]:
+    """Findings about a velocity against derivatives of positions, or about a position (not `derived`) against another.
 
-
-def _judge(name: str, looks: list[Comparison], blamed: set[str]) -> list[Finding]:
-    if not looks:
+    Positions in a wrong unit are added to `blamed`.
+    """
+    best = max(looks, key=lambda one: one.explained, default=None)
+    if best is None or best.whole is None or best.explained < LEAST_EXPLAINED_SHARE:
         return []
-    best = max(looks, key=lambda one: one.explained)
-    whole = best.whole
-    if whole is None or best.explained < LEAST_EXPLAINED_SHARE:
-        return []
-    head = f"{name} against the derivative of {best.against}: "
-    evidence = best.evidence()
+    what, other, slope = "the derivative of " if derived else "", best.against, best.whole.value
     if best.choice.denied:
-        return [misread("velocities", name, best, _MISREAD, noun="world")]
-    unit = axes.known_factor(whole, VELOCITY_UNITS)
+        return [hypotheses.misread("velocities", name, best, _MISREAD, noun="world", what=what)]
+    inverse = {key: 1.0 / factor for key, factor in POSITION_UNITS.items()}
+    unit = hypotheses.known_factor(best.whole, VELOCITY_UNITS if derived else inverse)
     if unit:
-        text = f"{head}it is {whole.value:.4g} times as large: it is in {unit[0]}, not m/s."
-        return [wrong_unit("velocities", name, text, unit[1], evidence)]
-    unit = axes.known_factor(whole, POSITION_UNITS)
+        text = f"{name} against {what}{other}: it is {slope:.4g} times as large: it is in {unit[0]}, not m"
+        text += "/s." if derived else "."
+        return [hypotheses.wrong_unit("velocities", name, text, unit[1], best.evidence())]
+    unit = hypotheses.known_factor(best.whole, POSITION_UNITS)
     if unit:
-        if best.against in blamed:
+        if other in blamed:
             return []
-        blamed.add(best.against)
-        text = f"The derivative of {best.against} is {1 / whole.value:.4g} times {name}: it is in {unit[0]}, not m."
-        return [wrong_unit("velocities", best.against, text, 1.0 / unit[1], evidence)]
-    return wrong_scale(
-        "velocities", name, looks, SCALE_FAULT,
-        alone="One of the two is wrong, and a third measurement must say which.",
-        agreed="Positions of two origins agree against it: divide the velocity by the factor.",
-    )  # fmt: skip
-
-
-def _judge_position(name: str, seen: Comparison, blamed: set[str]) -> list[Finding]:
-    whole = seen.whole
-    if whole is None or seen.explained < LEAST_EXPLAINED_SHARE:
-        return []
-    head = f"{name} against {seen.against}: "
-    if seen.choice.denied:
-        return [misread("velocities", name, seen, _MISREAD, noun="world", what="")]
-    unit = axes.known_factor(whole, POSITION_UNITS)
-    if unit:
-        blamed.add(seen.against)
-        text = (
-            f"{seen.against} against {name}: it is {1.0 / whole.value:.4g} times as large: it is in {unit[0]}, not m."
-        )
-        return [wrong_unit("velocities", seen.against, text, 1.0 / unit[1], seen.evidence())]
-    unit = axes.known_factor(whole, {key: 1.0 / factor for key, factor in POSITION_UNITS.items()})
-    if unit:
-        text = f"{head}it is {whole.value:.4g} times as large: it is in {unit[0]}, not m."
-        return [wrong_unit("velocities", name, text, unit[1], seen.evidence())]
-    agreed = agreed_scale([seen], SCALE_FAULT)
+        blamed.add(other)
+        text = f"{other} against {name}: it is {1.0 / slope:.4g} times as large: it is in {unit[0]}, not m."
+        if derived:
+            text = f"The derivative of {other} is {1.0 / slope:.4g} times {name}: it is in {unit[0]}, not m."
+        return [hypotheses.wrong_unit("velocities", other, text, 1.0 / unit[1], best.evidence())]
+    if derived:
+        return hypotheses.wrong_scale(
+            "velocities", name, looks, SCALE_FAULT,
+            alone="One of the two is wrong, and a third measurement must say which.",
+            agreed="Positions of two origins agree against it: divide the velocity by the factor.",
+        )  # fmt: skip
+    agreed = hypotheses.agreed_scale(looks, SCALE_FAULT)
     if agreed is None:
         return []
-    numbers = {**seen.evidence(), **axes.numbers(seen.single)}
-    text = f"{name} and {seen.against} differ in scale: {agreed[1].text}, if {seen.against} is right."
+    numbers = {**best.evidence(), **hypotheses.slope_numbers(best.single)}
+    text = f"{name} and {other} differ in scale: {agreed[1].text}, if {other} is right."
     advice = "Find out which of the two is calibrated."
     return [Finding("velocities", Grade.DEGRADES, text, name, (), numbers, advice)]

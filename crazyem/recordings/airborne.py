@@ -39,27 +39,17 @@ _FEWEST_SAMPLES = 10  # a signal with no more samples is not used
 
 @dataclass(frozen=True, slots=True)
 class Airtime:
-    """When the drone flew.
+    """When the drone flew."""
 
-    Attributes:
-        flown: intervals in the air [s]; the whole recording if no signal shows a flight (`known` is False).
-        airborne: as `flown`, with bounces before the climb and after the descent, in which the floor may push.
-        lifting: intervals in which the rotors carried about the weight; as `airborne` without a signal of the rotors.
-        judged_by: names of the signals that were used; () without any.
-        reason: why the drone never flew, one clause; "" if it flew.
-        ground: height of the ground in the frame of the position [m]; NaN where unknown.
-        climbed: m, range of height; NaN without a position.
-        begin, end: s; first and last sample of the signal that was used first.
-    """
-
-    airborne: Intervals
-    flown: Intervals
+    airborne: Intervals  # as `flown`, with bounces before the climb and after the descent, in which the floor may push
+    flown: Intervals  # intervals in the air [s]; the whole recording if no signal shows a flight (`known` is False)
+    # intervals in which the rotors carried about the weight; as `airborne` without a signal of the rotors
     lifting: Intervals
-    judged_by: tuple[str, ...]
-    reason: str = ""
-    ground: float = math.nan
-    climbed: float = math.nan
-    begin: float = math.nan
+    judged_by: tuple[str, ...]  # names of the signals that were used; () without any
+    reason: str = ""  # why the drone never flew, one clause; "" if it flew
+    ground: float = math.nan  # height of the ground in the frame of the position [m]; NaN where unknown
+    climbed: float = math.nan  # m, range of height; NaN without a position
+    begin: float = math.nan  # begin, end: s; first and last sample of the signal that was used first
     end: float = math.nan
 
     @property

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.recordings.finding import Finding
-from crazyem.recordings.recording import Event, Recording, SignalArray
+from crazyem.recordings.recording import Event, Recording, SignalArray, about
 
 # Units of the components where they differ within a signal.
 _MIXED_UNITS: dict[str, tuple[str, ...]] = {"wrench_command": ("N", "N m", "N m", "N m")}
@@ -20,23 +20,17 @@ MARKED_COLUMN = "marked"
 
 @dataclass(frozen=True, slots=True)
 class SignalEntry:
-    """All that is known of a signal besides its samples (see `SignalArray`).
+    """All that is known of a signal besides its samples (see `SignalArray`)."""
 
-    Attributes:
-        name: in the recording.
-        components: their names, ("",) for a scalar.
-        marked: True if some of its samples are marked.
-    """
-
-    name: str
-    components: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
+    name: str  # in the recording
+    components: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]  # their names, ("",) for a scalar
     quantity: str
     unit: str
     frame: str
     clock: str
     stream: str
     source: tuple[str, ...]
-    marked: bool = False
+    marked: bool = False  # True if some of its samples are marked
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -49,32 +43,16 @@ def entry_of(name: str, array: SignalArray) -> SignalEntry:
     """The entry of a signal."""
     count = array.value.shape[1]
     parts = array.components if len(array.components) == count else tuple(str(i) for i in range(count))
-    return SignalEntry(
-        name,
-        ("",) if count == 1 else parts,
-        array.quantity,
-        array.unit,
-        array.frame,
-        array.clock,
-        array.stream,
-        array.source,
-        bool(array.marked.any()),
-    )
+    return SignalEntry(name, ("",) if count == 1 else parts, **about(array), marked=bool(array.marked.any()))
 
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """All that a recording holds besides samples; of a recording in parts: of all parts together.
+    """All that a recording holds besides samples; of a recording in parts: of all parts together."""
 
-    Attributes:
-        source: as in `Recording`.
-        entries: one a signal, in the order of the recording.
-        origin, metadata, findings, events: as in `Recording`.
-    """
-
-    source: str
-    entries: tuple[SignalEntry, ...]
-    origin: float = 0.0
+    source: str  # as in `Recording`
+    entries: tuple[SignalEntry, ...]  # one a signal, in the order of the recording
+    origin: float = 0.0  # origin, metadata, findings, events: as in `Recording`
     metadata: dict[str, dict[str, str]] | None = None
     findings: tuple[Finding, ...] = ()
     events: tuple[Event, ...] = ()
@@ -98,19 +76,12 @@ class Description:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column of the table.
+    """A column of the table."""
 
-    Attributes:
-        name: unique, printable, without unit: "position_x", "voltage", "position_marked".
-        unit: of its numbers.
-        entry: the signal.
-        component: number of the component; None for the flag of marked samples.
-    """
-
-    name: str
-    unit: str
-    entry: SignalEntry
-    component: int | None
+    name: str  # unique, printable, without unit: "position_x", "voltage", "position_marked"
+    unit: str  # of its numbers
+    entry: SignalEntry  # the signal
+    component: int | None  # number of the component; None for the flag of marked samples
 
     @property
     def title(self) -> str:
@@ -156,19 +127,12 @@ def describe(parts: Iterable[Recording]) -> Description:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """Consecutive rows of a table: runs of samples, in processing order, with one stamp and one host time.
+    """Consecutive rows of a table: runs of samples, in processing order, with one stamp and one host time."""
 
-    Attributes:
-        time: (r,) s.
-        host_time: (r,) s since the epoch, NaN where unknown.
-        row: signal -> (n,) row of each of its samples, ascending.
-        sample: signal -> (n,) number of that sample in its array.
-    """
-
-    time: NDArray[np.float64]
-    host_time: NDArray[np.float64]
-    row: dict[str, NDArray[np.int64]]
-    sample: dict[str, NDArray[np.int64]]
+    time: NDArray[np.float64]  # (r,) s
+    host_time: NDArray[np.float64]  # (r,) s since the epoch, NaN where unknown
+    row: dict[str, NDArray[np.int64]]  # signal -> (n,) row of each of its samples, ascending
+    sample: dict[str, NDArray[np.int64]]  # signal -> (n,) number of that sample in its array
 
 
 def rows_of(recording: Recording, names: Iterable[str], *, samples: int = 1 << 16) -> Iterator[Rows]:
@@ -182,12 +146,17 @@ def rows_of(recording: Recording, names: Iterable[str], *, samples: int = 1 << 1
         samples: largest number of samples of a signal in a block.
     """
     arrays = {name: recording.signals[name] for name in names if name in recording.signals}
-    places = {name: _by_order(array.order) for name, array in arrays.items()}
-    orders = {name: a.order if places[name] is None else a.order[places[name]] for name, a in arrays.items()}
+    # numbers of the samples in processing order; None if they are in this order already
+    places = {
+        name: None if (a.order[1:] >= a.order[:-1]).all() else np.argsort(a.order, kind="stable")
+        for name, a in arrays.items()
+    }
+    orders = {name: a.order if (p := places[name]) is None else a.order[p] for name, a in arrays.items()}
     at, most = dict.fromkeys(arrays, 0), samples
     while any(at[name] < order.size for name, order in orders.items()):
         ends = _ends(orders, at, most)
-        taken = {name: _slice(places[name], at[name], ends[name]) for name in arrays}
+        spans = {name: np.arange(at[name], ends[name]) for name in arrays}
+        taken = {name: span if (p := places[name]) is None else p[span] for name, span in spans.items()}
         rows = _rows(arrays, taken)
         if any(ends[name] < order.size for name, order in orders.items()):
             if rows.time.size < 2:  # the first row may continue in the next block
@@ -197,15 +166,6 @@ def rows_of(recording: Recording, names: Iterable[str], *, samples: int = 1 << 1
             ends = {name: at[name] + rows.row[name].size for name in arrays}
         yield rows
         at, most = ends, samples
-
-
-def _by_order(order: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """(n,) numbers of the samples in processing order; None if they are in this order already."""
-    return None if (order[1:] >= order[:-1]).all() else np.argsort(order, kind="stable")
-
-
-def _slice(place: NDArray[np.int64] | None, begin: int, end: int) -> NDArray[np.int64]:
-    return np.arange(begin, end) if place is None else place[begin:end]
 
 
 def _ends(orders: dict[str, NDArray[np.int64]], at: dict[str, int], most: int) -> dict[str, int]:

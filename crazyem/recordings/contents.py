@@ -1,5 +1,6 @@
 """Shared by all readers: options of the user, the bytes of a file with a bounded size, and arrays that grow."""
 
+import contextlib
 import gzip
 import zlib
 from collections.abc import Iterator
@@ -38,27 +39,36 @@ LARGEST_UNPACKED = 1 << 30  # bytes of a gzip file, unpacked: guards against dec
 _HEAD_BYTES = 64 * 1024
 
 
-def pieces(path: Path, size: int) -> Iterator[bytes]:
-    """The bytes of a plain or gzip file (recognised by its content), unpacked, in pieces of up to `size` bytes.
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[tuple[IO[bytes], IO[bytes], bool]]:
+    """A plain or gzip file (recognised by its content), its unpacked content, and whether it is packed.
 
-    Raises: UsageError if the file cannot be read, FileFormatError if a gzip file cannot be unpacked or unpacks to more
-        than `LARGEST_UNPACKED`.
+    Raises: UsageError if the file cannot be read, FileFormatError if a gzip file cannot be unpacked.
     """
-    taken = 0
     try:
-        with path.open("rb") as file:
-            packed = file.read(2) == b"\x1f\x8b"
-        with cast(IO[bytes], gzip.open(path, "rb")) if packed else path.open("rb") as file:
-            while piece := file.read(size):
-                taken += len(piece)
-                if packed and taken > LARGEST_UNPACKED:
-                    most = f"{LARGEST_UNPACKED >> 20} MiB"
-                    raise FileFormatError(f"{path} unpacks to more than {most}; unpack it yourself if it is sound.")
-                yield piece
+        with path.open("rb") as raw:
+            packed = raw.read(2) == b"\x1f\x8b"
+            raw.seek(0)
+            yield raw, cast(IO[bytes], gzip.GzipFile(fileobj=raw)) if packed else raw, packed
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise FileFormatError(f"{path} is not a readable gzip file ({error}).") from error
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
+
+
+def pieces(path: Path, size: int) -> Iterator[bytes]:
+    """The bytes of a file, unpacked, in pieces of up to `size` bytes.
+
+    Raises: as `opened`; FileFormatError if a gzip file unpacks to more than `LARGEST_UNPACKED`.
+    """
+    taken = 0
+    with opened(path) as (_, file, packed):
+        while piece := file.read(size):
+            taken += len(piece)
+            if packed and taken > LARGEST_UNPACKED:
+                most = f"{LARGEST_UNPACKED >> 20} MiB"
+                raise FileFormatError(f"{path} unpacks to more than {most}; unpack it yourself if it is sound.")
+            yield piece
 
 
 def head_of(path: Path) -> bytes:

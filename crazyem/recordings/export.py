@@ -8,18 +8,105 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 from urllib.parse import quote
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from crazyem.atomic_file import new_file
 from crazyem.errors import UsageError
-from crazyem.recordings.columns import Column, Description, Rows, describe, rows_of
-from crazyem.recordings.description import to_json
-from crazyem.recordings.recording import Recording
+from crazyem.recordings.columns import Column, Description, Rows, SignalEntry, describe, rows_of
+from crazyem.recordings.finding import Finding
+from crazyem.recordings.recording import Event, Recording
+
+_LARGEST_ROW = 2**62
+
+
+class _Event(msgspec.Struct, rename={"time": "time_s"}):
+    """An `Event` in the file."""
+
+    time: float
+    kind: str
+    data: dict[str, Any]
+
+
+class _File(msgspec.Struct):
+    """A `Description` in the file; missing keys and other types are refused."""
+
+    version: Literal[1]
+    source: str
+    origin_s: float
+    signals: tuple[SignalEntry, ...]
+    findings: tuple[Finding, ...]
+    events: tuple[_Event, ...]
+    metadata: dict[str, dict[str, Any]] = {}
+
+
+def to_json(description: Description) -> dict[str, Any]:
+    """For `json.dumps(..., allow_nan=False)`."""
+    return {
+        "version": 1,
+        "source": description.source,
+        "origin_s": _plain(float(description.origin)),
+        "signals": msgspec.to_builtins(description.entries),
+        "metadata": _plain(description.metadata or {}),
+        "findings": [_plain(f.to_dict(np.ndarray.tolist)) for f in description.findings],
+        "events": [_plain({"time_s": float(e.time), "kind": e.kind, "data": e.data}) for e in description.events],
+    }
+
+
+def from_json(table: Any) -> Description:
+    """Inverse of `to_json`. Raises ValueError with the reason."""
+    if not isinstance(table, dict):
+        raise ValueError("it is no table")
+    table = {key: value if key == "metadata" else _back(value) for key, value in table.items()}
+    file = msgspec.convert(table, _File, dec_hook=_rows)
+    return Description(
+        file.source,
+        file.signals,
+        file.origin_s,
+        {name: {key: str(value) for key, value in section.items()} for name, section in file.metadata.items()},
+        file.findings,
+        tuple(Event(event.time, event.kind, event.data) for event in file.events),
+    )
+
+
+def _plain(value: Any) -> Any:
+    """The value in types of JSON; NaN becomes {"number": "nan"}, infinities likewise."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return {"number": repr(value)}
+    if isinstance(value, bytes):
+        return {"bytes": value.hex()}
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def _back(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_back(v) for v in value]
+    if not isinstance(value, dict):
+        return value
+    if set(value) == {"number"} and value["number"] in ("nan", "inf", "-inf"):
+        return float(value["number"])
+    if set(value) == {"bytes"} and isinstance(value["bytes"], str):
+        return bytes.fromhex(value["bytes"])
+    return {k: _back(v) for k, v in value.items()}
+
+
+def _rows(kind: type, value: Any) -> NDArray[np.int64]:
+    """Rows of a fix: the only numpy array in a finding."""
+    rows = msgspec.convert(value, list[Annotated[int, msgspec.Meta(ge=0, le=_LARGEST_ROW)]])
+    return np.array(rows, np.int64)
+
 
 TIME, HOST_TIME = "time [s]", "host_time [s]"
 METADATA_SUFFIX = "-metadata.json"  # CSVW: where programs look for the description of a CSV
@@ -133,19 +220,14 @@ def _schema(description: Description) -> Any:
 
 def _about(column: Column) -> dict[str, str]:
     """The known properties of a column, by name."""
-    entry = column.entry
+    entry, part = column.entry, column.component
+    one = part is not None and len(entry.source) == len(entry.components)
+    source = entry.source[part or 0] if one else ", ".join(entry.source)
     about = {"signal": entry.name, "quantity": entry.quantity, "unit": column.unit, "frame": entry.frame}
-    about |= {"clock": entry.clock, "stream": entry.stream, "source": _source(column)}
+    about |= {"clock": entry.clock, "stream": entry.stream, "source": source}
     if column.component is None:
         about["description"] = "true where the sample was not measured, or the sensor said that it has none"
     return {k: v for k, v in about.items() if v}
-
-
-def _source(column: Column) -> str:
-    source = column.entry.source
-    if len(source) == len(column.entry.components) and column.component is not None:
-        return source[column.component]
-    return ", ".join(source)
 
 
 def attributes(description: Description) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Findings, the problems of a recording: each with a name, times, a grade, evidence and advice."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -42,39 +42,30 @@ class Fix:
     factor: tuple[float, ...] = ()
     rows: NDArray[np.int64] | None = None
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON: the rows as a count."""
-        count = None if self.rows is None else int(self.rows.size)
-        return {"kind": self.kind, "signals": list(self.signals), "factor": list(self.factor), "rows": count}
+    def to_dict(self, rows: Callable[[NDArray[np.int64]], object] = np.size) -> dict[str, Any]:
+        """For JSON: the rows as a count, or as `rows` makes of them."""
+        made = None if self.rows is None else rows(self.rows)
+        return {"kind": self.kind, "signals": list(self.signals), "factor": list(self.factor), "rows": made}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finding:
-    """One problem or remarkable property of a recording.
+    """One problem or remarkable property of a recording."""
 
-    Attributes:
-        check: which check found it, e.g. "gaps"; readers use "integrity", "interpolated", "mapping", "motor_meaning",
-            "stamps".
-        grade: how much it matters.
-        text: one sentence for people.
-        signal: name of the signal concerned; "" for the whole recording.
-        intervals: (start, end) in s on the recording's time axis, in order; () for the whole recording.
-        evidence: numbers that support the finding, by a name that has the unit ("longest_s", "slope", "share").
-        advice: what to do, one sentence.
-        fix: a lossless repair, None if there is none.
-    """
-
+    # which check found it, e.g. "gaps"; readers use "integrity", "interpolated", "mapping", "motor_meaning", "stamps".
     check: str
-    grade: Grade
-    text: str
-    signal: str = ""
+    grade: Grade  # how much it matters
+    text: str  # one sentence for people
+    signal: str = ""  # name of the signal concerned; "" for the whole recording
+    # (start, end) in s on the recording's time axis, in order; () for the whole recording
     intervals: tuple[tuple[float, float], ...] = ()
+    # numbers that support the finding, by a name that has the unit ("longest_s", "slope", "share")
     evidence: Mapping[str, float] = field(default_factory=dict)
-    advice: str = ""
-    fix: Fix | None = None
+    advice: str = ""  # what to do, one sentence
+    fix: Fix | None = None  # a lossless repair, None if there is none
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+    def to_dict(self, rows: Callable[[NDArray[np.int64]], object] = np.size) -> dict[str, Any]:
+        """For JSON; `rows` as for `Fix.to_dict`."""
         return {
             "check": self.check,
             "grade": str(self.grade),
@@ -83,7 +74,7 @@ class Finding:
             "intervals": [[float(a), float(b)] for a, b in self.intervals],
             "evidence": {k: float(v) for k, v in self.evidence.items()},
             "advice": self.advice,
-            "fix": None if self.fix is None else self.fix.to_dict(),
+            "fix": None if self.fix is None else self.fix.to_dict(rows),
         }
 
 
@@ -95,9 +86,9 @@ def percent(share: float) -> str:
     return f"{100.0 * share:.0f} %" if size >= 9.95 else f"{100.0 * share:.2g} %"
 
 
-def note(check: str, text: str, grade: Grade = Grade.HARMLESS, **evidence: float) -> Finding:
-    """A finding of a reader: a sentence and its numbers."""
-    return Finding(check, grade, text, evidence=evidence)
+def note(check: str, text: str, grade: Grade = Grade.HARMLESS, advice: str = "", **evidence: float) -> Finding:
+    """A finding about a whole recording: a sentence, advice and its numbers."""
+    return Finding(check, grade, text, evidence=evidence, advice=advice)
 
 
 def runs_of(flags: NDArray[np.bool_]) -> NDArray[np.int64]:

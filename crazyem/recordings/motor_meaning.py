@@ -48,19 +48,14 @@ _MEANING_NAMES = {"duty": "the PWM sent, after battery compensation", "request":
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Meaning:
-    """The meaning of motor.m1..4.
+    """The meaning of motor.m1..4."""
 
-    Attributes:
-        meaning: "duty" (PWM sent, after battery compensation), "request" (thrust asked for, before compensation), or
-            None without evidence or without motor.m1..4.
-        reason: why, one sentence; "" without motor.m1..4.
-        evidence: the numbers that support it.
-        findings: for the `findings` of the recording: the decision, a question to the user, or a contradiction.
-    """
-
+    # "duty" (PWM sent, after battery compensation), "request" (thrust asked for, before compensation), or None without
+    # evidence or without motor.m1..4
     meaning: str | None
-    reason: str = ""
-    evidence: Mapping[str, float] = field(default_factory=dict)
+    reason: str = ""  # why, one sentence; "" without motor.m1..4
+    evidence: Mapping[str, float] = field(default_factory=dict)  # the numbers that support it
+    # for the `findings` of the recording: the decision, a question to the user, or a contradiction
     findings: tuple[Finding, ...] = ()
 
     @property
@@ -69,14 +64,8 @@ class Meaning:
         return {"motor": {"meaning": self.meaning or "unknown", "reason": self.reason}} if self.reason else {}
 
 
-@dataclass(slots=True)
-class _Votes:
-    """Votes by kind of evidence: ("duty" or "request", reason)."""
-
-    numbers: list[tuple[str, str]] = field(default_factory=list)  # pwm.*: the PWM itself
-    age: list[tuple[str, str]] = field(default_factory=list)
-    mixer: list[tuple[str, str]] = field(default_factory=list)
-    evidence: dict[str, float] = field(default_factory=dict)
+# "duty" or "request", and the reason
+_Vote = tuple[str, str]
 
 
 def decide(
@@ -98,26 +87,20 @@ def decide(
     table = next((t for t in tables if set(MOTOR_VARIABLES) <= t.columns.keys()), None)
     if table is None:
         return Meaning(None)
-    votes = _Votes()
-    _compare_with_sent(table, votes)
-    _judge_age(tables, metadata or {}, votes)
-    _judge_mixer(table, votes)
-    decided, reason = _weigh(votes)
-    return _answer(decided, reason, given, votes.evidence)
+    evidence: dict[str, float] = {}
+    sent = _compare_with_sent(table, evidence)
+    ages, mixer = _judge_age(tables, metadata or {}), _judge_mixer(table, evidence)
+    return _answer(*(sent or _weigh(ages, mixer)), given, evidence)
 
 
-def _weigh(votes: _Votes) -> tuple[str | None, str]:
-    """The verdict of all votes, with its reason."""
-    if votes.numbers:
-        return votes.numbers[0]
-    ages = {vote for vote, _ in votes.age}
-    mixer = votes.mixer[0] if votes.mixer else None
-    words = "; ".join(text for _, text in votes.age)
-    if len(ages) > 1:
+def _weigh(ages: Sequence[_Vote], mixer: _Vote | None) -> tuple[str | None, str]:
+    """The verdict of the votes of age and mixer, with its reason."""
+    meanings, words = {meaning for meaning, _ in ages}, "; ".join(text for _, text in ages)
+    if len(meanings) > 1:
         return None, f"the log contradicts itself: {words}"
-    if not ages:
-        return mixer if mixer else (None, "nothing in the log tells")
-    (age,) = ages
+    if not meanings:
+        return mixer or (None, "nothing in the log tells")
+    (age,) = meanings
     if mixer is None or mixer[0] == age:
         return age, "; ".join([words] + ([mixer[1]] if mixer else []))
     if age == "duty":  # new firmware sends the mixer's output as it is where compensation is switched off
@@ -126,24 +109,21 @@ def _weigh(votes: _Votes) -> tuple[str | None, str]:
 
 
 def _answer(decided: str | None, reason: str, given: str | None, evidence: dict[str, float]) -> Meaning:
-    if decided is None and given is None:
+    meaning, grade, advice = given or decided, Grade.DEGRADES, ""
+    if meaning is None:
         either = f"{_MEANING_NAMES['duty']}, or {_MEANING_NAMES['request']}"
         text = f"What motor.m1..4 is cannot be told ({reason}): it may be {either}."
-        grade = Grade.DEGRADES
-        finding = Finding("motor_meaning", grade, text, "", (), evidence, "Say --motor duty or --motor request.")
-        return Meaning(None, reason, evidence, (finding,))
-    if decided is None:
-        reason = f"said by the user; {reason}"
-    if given is not None and decided not in (None, given):
-        contrary = f"{_MEANING_NAMES[decided]} ({reason})"
-        text = f"motor.m1..4 is taken as {_MEANING_NAMES[given]}, as told, but the log says: {contrary}."
+        advice = "Say --motor duty or --motor request."
+    elif decided not in (None, meaning):
+        contrary = f"{_MEANING_NAMES[str(decided)]} ({reason})"
+        text = f"motor.m1..4 is taken as {_MEANING_NAMES[meaning]}, as told, but the log says: {contrary}."
         advice = f"Leave --motor out, or say --motor {decided}."
-        finding = Finding("motor_meaning", Grade.DEGRADES, text, evidence=evidence, advice=advice)
-        return Meaning(given, f"said by the user, against the log ({reason})", evidence, (finding,))
-    meaning = given or decided
-    assert meaning is not None
-    text = f"motor.m1..4 is {_MEANING_NAMES[meaning]}: {reason}."
-    return Meaning(meaning, reason, evidence, (Finding("motor_meaning", Grade.HARMLESS, text, evidence=evidence),))
+        reason = f"said by the user, against the log ({reason})"
+    else:
+        reason = reason if decided else f"said by the user; {reason}"
+        grade, text = Grade.HARMLESS, f"motor.m1..4 is {_MEANING_NAMES[meaning]}: {reason}."
+    finding = Finding("motor_meaning", grade, text, evidence=evidence, advice=advice)
+    return Meaning(meaning, reason, evidence, (finding,))
 
 
 def _matrix(table: Table, names: Sequence[str]) -> NDArray[np.float64]:
@@ -151,25 +131,24 @@ def _matrix(table: Table, names: Sequence[str]) -> NDArray[np.float64]:
     return np.stack([np.asarray(table.columns[name], float) for name in names])
 
 
-def _compare_with_sent(table: Table, votes: _Votes) -> None:
+def _compare_with_sent(table: Table, evidence: dict[str, float]) -> _Vote | None:
     if not set(_PWM_VARIABLES) <= table.columns.keys():
-        return
+        return None
     motor, sent = _matrix(table, MOTOR_VARIABLES), _matrix(table, _PWM_VARIABLES)
     turning = (sent > 0) & (sent < _FULL_PWM)
     if turning.sum() < _FEWEST_ROWS:
-        return
+        return None
     equal = float((motor == sent)[turning].mean())
-    votes.evidence["pwm_equal_share"] = equal
-    voltage = _voltage(table)
+    evidence["pwm_equal_share"] = equal
     if equal > 0.5:
-        votes.numbers.append(("duty", f"it equals pwm.m1..4_pwm in {100 * equal:.0f} % of samples"))
-        return
+        return "duty", f"it equals pwm.m1..4_pwm in {100 * equal:.0f} % of samples"
     text = f"it equals pwm.m1..4_pwm in only {100 * equal:.1f} % of samples"
+    voltage = _voltage(table)
     if voltage is not None:
         error = float(np.median(np.abs(_compensated(motor, voltage) - sent)[turning]))
-        votes.evidence["compensation_error_counts"] = error
+        evidence["compensation_error_counts"] = error
         text += f", the old battery compensation turns one into the other within {error:.0f} counts (median)"
-    votes.numbers.append(("request", text))
+    return "request", text
 
 
 def _voltage(table: Table) -> NDArray[np.float64] | None:
@@ -186,23 +165,25 @@ def _compensated(request: NDArray[np.float64], voltage: NDArray[np.float64]) -> 
         return _FULL_PWM * (-0.0006239 * grams * grams + 0.088 * grams) / voltage
 
 
-def _judge_age(tables: Sequence[Table], metadata: Mapping[str, Mapping[str, str]], votes: _Votes) -> None:
+def _judge_age(tables: Sequence[Table], metadata: Mapping[str, Mapping[str, str]]) -> list[_Vote]:
+    votes: list[_Vote] = []
     names = {name for table in tables for name in table.columns}
     names.update(metadata.get("drone", {}).get("log_variables", "").split())
     for pattern, origin in _NEWER_VARIABLES:
         found = sorted(name for name in names if re.fullmatch(pattern, name))
         if found:
-            votes.age.append(("duty", f"the firmware has {found[0]}, which came later ({origin})"))
+            votes.append(("duty", f"the firmware has {found[0]}, which came later ({origin})"))
             break
     types = {table.ctypes[name] for table in tables for name in MOTOR_VARIABLES if name in table.ctypes}
     if types == {"uint16_t"}:
-        votes.age.append(("duty", "it is a uint16, as since 2024-05-29"))
+        votes.append(("duty", "it is a uint16, as since 2024-05-29"))
     elif types == {"int32_t"}:
-        votes.age.append(("request", "it is an int32, as until 2020-02-28"))
+        votes.append(("request", "it is an int32, as until 2020-02-28"))
     version = _version(metadata)
     if version is not None and not _LAST_OLD_RELEASE < version < _FIRST_NEW_RELEASE:
         meaning = "duty" if version >= _FIRST_NEW_RELEASE else "request"
-        votes.age.append((meaning, f"the firmware is of {version[0]}-{version[1]:02d}"))
+        votes.append((meaning, f"the firmware is of {version[0]}-{version[1]:02d}"))
+    return votes
 
 
 def _version(metadata: Mapping[str, Mapping[str, str]]) -> tuple[int, int] | None:
@@ -215,37 +196,36 @@ def _version(metadata: Mapping[str, Mapping[str, str]]) -> tuple[int, int] | Non
     return None
 
 
-def _judge_mixer(table: Table, votes: _Votes) -> None:
+def _judge_mixer(table: Table, evidence: dict[str, float]) -> _Vote | None:
     motor = _matrix(table, MOTOR_VARIABLES)
     # rows with a clipped rotor or four equal ones (idle on the ground) are no evidence about the mixer
     usable = ((motor > 0) & (motor < _FULL_PWM) & (motor == np.floor(motor))).all(axis=0) & (np.ptp(motor, axis=0) > 0)
     rows = int(usable.sum())
     if rows < _FEWEST_ROWS:
-        return
+        return None
     m1, m2, m3, m4 = motor[:, usable].astype(np.int64)
     whole = [(m1 + m3 - m2 - m4) % 4 == 0, (m1 + m2 - m3 - m4) % 4 == 0, (m1 + m4 - m2 - m3) % 4 == 0]
     share = float(np.logical_and.reduce(whole).mean())
-    votes.evidence |= {"mixer_share": share, "mixer_rows": rows}
-    _compare_with_mixer(table, motor, usable, votes)
+    evidence |= {"mixer_share": share, "mixer_rows": rows}
+    equal = _compare_with_mixer(table, motor, usable)
+    if equal is not None:
+        evidence["mixer_equal_share"] = equal
+        if equal > 0.5:
+            return "request", f"it is what the mixer makes of controller.cmd_* in {100 * equal:.0f} % of rows"
     text = f"it is on the mixer's whole-number grid in {100 * share:.1f} % of rows"
     if share > 0.9:
-        votes.mixer.append(("request", f"{text}, not compensated"))
-    elif share < 0.5:
-        votes.mixer.append(("duty", f"{text} (by chance: 6 %)"))
+        return "request", f"{text}, not compensated"
+    return ("duty", f"{text} (by chance: 6 %)") if share < 0.5 else None
 
 
-def _compare_with_mixer(table: Table, motor: NDArray[np.float64], usable: NDArray[np.bool_], votes: _Votes) -> None:
-    """Compare with m = T -+ r +- p +- y from controller.cmd_*, which are 0 unless the controller is the PID."""
+def _compare_with_mixer(table: Table, motor: NDArray[np.float64], usable: NDArray[np.bool_]) -> float | None:
+    """Share of rows with m = T -+ r +- p +- y from controller.cmd_*, which are 0 unless the controller is the PID."""
     if not set(_MIXER_VARIABLES) <= table.columns.keys():
-        return
+        return None
     thrust, roll, pitch, yaw = _matrix(table, _MIXER_VARIABLES)
     rows = usable & (thrust > 0)
     if rows.sum() < _FEWEST_ROWS:
-        return
+        return None
     r, p = np.trunc(roll / 2.0), np.trunc(pitch / 2.0)
     mixed = np.trunc(np.stack([thrust - r + p + yaw, thrust - r - p - yaw, thrust + r - p + yaw, thrust + r + p - yaw]))
-    equal = float((np.abs(mixed - motor) <= 1.0).all(axis=0)[rows].mean())
-    votes.evidence["mixer_equal_share"] = equal
-    if equal > 0.5:
-        text = f"it is what the mixer makes of controller.cmd_* in {100 * equal:.0f} % of rows"
-        votes.mixer.append(("request", text))
+    return float((np.abs(mixed - motor) <= 1.0).all(axis=0)[rows].mean())

@@ -73,3 +73,9 @@ def sound_samples(array: SignalArray) -> tuple[Array, Array] | None:
         return None
     time, value = ordered(array)
     return (time, value) if time.size else None
+
+
+def sound_signal(recording: Recording, name: str) -> tuple[Array, Array] | None:
+    """Times (n,) and values (n, c) of the samples that are numbers, in order of time; None if there are none."""
+    array = recording.signals.get(name)
+    return None if array is None else sound_samples(array)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class SignalArray:
     """All samples of one signal, as measured: at its own rate, neither resampled nor filled in.
 
@@ -74,19 +74,18 @@ class SignalArray:
         )
 
 
+def about(signal: Any) -> dict[str, Any]:
+    """What is known of a signal, from a `SignalArray` or an object with the same attributes."""
+    return {name: getattr(signal, name) for name in ("quantity", "unit", "frame", "clock", "stream", "source")}
+
+
 @dataclass(frozen=True, slots=True)
 class Event:
-    """An event in the flight: a setpoint, a write of a parameter, an estimate or a log message.
+    """An event in the flight: a setpoint, a write of a parameter, an estimate or a log message."""
 
-    Attributes:
-        time: s since the epoch (host clock).
-        kind: "setpoint", "parameter_write", "estimate" or "log".
-        data: its fields by name.
-    """
-
-    time: float
-    kind: str
-    data: Mapping[str, object]
+    time: float  # s since the epoch (host clock)
+    kind: str  # "setpoint", "parameter_write", "estimate" or "log"
+    data: Mapping[str, object]  # its fields by name
 
 
 @dataclass(frozen=True, slots=True, eq=False)

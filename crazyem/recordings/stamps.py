@@ -19,10 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.ordering import Array, Flags
 from crazyem.recordings.recording import Recording, SignalArray
-
-Column = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 LONGEST_RECORDING = 86_400.0  # s; no recording of a flight is longer than a day
 RESTART_SECONDS = 1.0  # s; a larger step back is a clock that was set or restarted, a smaller one a late record
@@ -32,24 +30,16 @@ STAMP_CHECK = "stamps"
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Impossible stamps of one stream.
+    """Impossible stamps of one stream."""
 
-    Attributes:
-        stream: its name.
-        count: number of records with such stamps.
-        total: number of records of the stream.
-        what: treatment of these records: "left out", "placed by arrival" or "shifted".
-        example: one of the stamps [s], as in the file; for "shifted": the shift [s].
-    """
-
-    stream: str
-    count: int
-    total: int
-    what: str
-    example: float
+    stream: str  # its name
+    count: int  # number of records with such stamps
+    total: int  # number of records of the stream
+    what: str  # treatment of these records: "left out", "placed by arrival" or "shifted"
+    example: float  # one of the stamps [s], as in the file; for "shifted": the shift [s]
 
 
-def impossible(time: Column, *, centre: float | None = None, absent: float | None = None) -> Flags:
+def impossible(time: Array, *, centre: float | None = None, absent: float | None = None) -> Flags:
     """(n,) True for impossible stamps.
 
     Args:
@@ -71,12 +61,12 @@ def impossible(time: Column, *, centre: float | None = None, absent: float | Non
     return bad
 
 
-def _sound(time: Column) -> bool:
+def _sound(time: Array) -> bool:
     """Whether all stamps are possible: in order, and no longer than a recording can be."""
     return time.size < 2 or bool((np.diff(time) >= 0).all() and time[-1] - time[0] <= LONGEST_RECORDING)
 
 
-def out_of_order(time: Column) -> Flags:
+def out_of_order(time: Array) -> Flags:
     """(n,) True where a stamp breaks the order of those around it and is far from their median."""
     if time.size < 3 or bool((np.diff(time) >= 0).all()):
         return np.zeros(time.size, bool)
@@ -92,7 +82,7 @@ def out_of_order(time: Column) -> Flags:
     return _without_those_in_order(time, far & broken, away)
 
 
-def _without_those_in_order(time: Column, odd: Flags, away: Column) -> Flags:
+def _without_those_in_order(time: Array, odd: Flags, away: Array) -> Flags:
     """Clear the flags of stamps that fit between the unflagged ones, in the order of their distance to the median."""
     kept = np.flatnonzero(~odd).tolist()
     for row in sorted(np.flatnonzero(odd).tolist(), key=lambda row: away[row]):
@@ -106,13 +96,13 @@ def _without_those_in_order(time: Column, odd: Flags, away: Column) -> Flags:
     return found
 
 
-def _running_median(time: Column) -> Column:
+def _running_median(time: Array) -> Array:
     from scipy.ndimage import median_filter  # slow to import and rarely needed
 
     return np.asarray(median_filter(time, 2 * _NEIGHBOURS + 1, mode="mirror"), float)
 
 
-def restarts(time: Column) -> NDArray[np.int64]:
+def restarts(time: Array) -> NDArray[np.int64]:
     """Rows (k,) at which a clock restarts, from (n,) stamps [s] of one or more streams in order of arrival.
 
     The running median shows a restart; a few late or impossible stamps do not change the median.
@@ -128,7 +118,7 @@ def restarts(time: Column) -> NDArray[np.int64]:
     return np.unique(np.array(rows, np.int64))
 
 
-def clock_offset(time: Column, place: Column, others: Column, places: Column) -> float | None:
+def clock_offset(time: Array, place: Array, others: Array, places: Array) -> float | None:
     """Seconds to add to the stamps of another clock; None if this clock does not run like that of the others.
 
     Args:
@@ -143,7 +133,7 @@ def clock_offset(time: Column, place: Column, others: Column, places: Column) ->
 
 
 def believed(
-    names: Sequence[str], times: Sequence[Column], places: Sequence[Column], *, absent: float | None = None
+    names: Sequence[str], times: Sequence[Array], places: Sequence[Array], *, absent: float | None = None
 ) -> tuple[list[Flags], list[float], list[Fault]]:
     """Bring all streams to one clock, that of most records.
 
@@ -178,11 +168,11 @@ def believed(
     return keep, shifts, faults
 
 
-def finding(faults: Sequence[Fault], signals: Iterable[str] = ()) -> list[Finding]:
+def finding(faults: Sequence[Fault], signals: Iterable[str] | Mapping[str, SignalArray] = ()) -> list[Finding]:
     """One finding for all faults of a recording; none without faults.
 
     Args:
-        signals: names of the affected signals that the recording still has.
+        signals: names of the affected signals that the recording still has, or all its signals.
     """
     if not faults:
         return []
@@ -192,6 +182,9 @@ def finding(faults: Sequence[Fault], signals: Iterable[str] = ()) -> list[Findin
     if len(faults) > len(said):
         said.append(f"and so on in {len(faults) - len(said)} more streams")
     grave = bool(moved) or any(fault.count > 1 and 2 * fault.count >= fault.total for fault in faults)
+    if isinstance(signals, Mapping):
+        streams = {fault.stream for fault in faults}
+        signals = [name for name, array in signals.items() if array.stream in streams]
     names = tuple(dict.fromkeys(signals))
     advice = "Look for what wrote these stamps: much of the recording has no time." if grave else ""
     if moved:
@@ -203,12 +196,6 @@ def finding(faults: Sequence[Fault], signals: Iterable[str] = ()) -> list[Findin
     fix = Fix(STAMP_CHECK, names) if names else None
     found = Finding(STAMP_CHECK, Grade.DEGRADES if grave else Grade.HARMLESS, text, "", (), evidence, advice, fix)
     return [found]
-
-
-def finding_in(faults: Sequence[Fault], signals: Mapping[str, SignalArray]) -> list[Finding]:
-    """As `finding`, with the names of the signals whose streams have faults."""
-    streams = {fault.stream for fault in faults}
-    return finding(faults, [name for name, array in signals.items() if array.stream in streams])
 
 
 def _words(fault: Fault) -> str:
@@ -234,7 +221,7 @@ def screened_parts(parts: Iterator[Recording]) -> Iterator[Recording]:
 
     The neighbours of a stamp include those in the parts before and after.
     """
-    before: dict[str, Column] = {}
+    before: dict[str, Array] = {}
     faults: dict[str, Fault] = {}
     totals: dict[str, int] = {}
     names: list[str] = []
@@ -288,12 +275,13 @@ def _streams(recording: Recording) -> Iterator[tuple[str, SignalArray]]:
             yield array.stream or name, array
 
 
-def _kept(recording: Recording, before: Mapping[str, Column], after: Recording | None) -> dict[int, NDArray[np.int64]]:
+def _kept(recording: Recording, before: Mapping[str, Array], after: Recording | None) -> dict[int, NDArray[np.int64]]:
     """Rows to keep, by the id of the array of stamps; only for streams that lose rows."""
     later = {s: a.time[:_NEIGHBOURS] for s, a in _streams(after)} if after is not None else {}
     streams = list(_streams(recording))
     times = [np.concatenate([before.get(s, np.empty(0)), a.time, later.get(s, np.empty(0))]) for s, a in streams]
-    if all(_sound(time) for time in times) and _close(times):
+    ends = np.concatenate([time[[0, -1]] for time in times if time.size] or [np.zeros(1)])
+    if all(_sound(time) for time in times) and ends.max() - ends.min() <= LONGEST_RECORDING:
         return {}
     pooled = np.concatenate(times)
     pooled = pooled[np.isfinite(pooled)]
@@ -317,9 +305,3 @@ def _without(recording: Recording, kept: Mapping[int, NDArray[np.int64]], *, who
         if rows is None or rows.size or not whole:
             signals[name] = array if rows is None else array.rows(rows)
     return replace(recording, signals=signals)
-
-
-def _close(times: Sequence[Column]) -> bool:
-    """Whether all streams together (each in order) are no longer than a recording can be."""
-    ends = np.concatenate([time[[0, -1]] for time in times if time.size] or [np.zeros(1)])
-    return bool(ends.max() - ends.min() <= LONGEST_RECORDING)

@@ -8,16 +8,13 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crazyem.physics import folding
 from crazyem.physics.rotors import wrench_from_command, wrench_from_speed
 from crazyem.recordings.airborne import Airtime
-from crazyem.recordings.ordering import held, sound_samples
+from crazyem.recordings.ordering import Array, held, sound_samples
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import GRAVITY, Vehicle, load_vehicle, preset_names
-
-Array = NDArray[np.float64]
 
 # s; longest interval between samples of a command or rotor speed. Rotors lag by 30 to 70 ms, so their thrust between
 # samples further apart is unknown.
@@ -79,17 +76,18 @@ def signal_for(recording: Recording, vehicle: Vehicle) -> tuple[str, str]:
     other = kind_objection(recording)
     if other:
         return "", other
-    laws = {"rotor_speed": vehicle.rotor_constant is not None, "motor_command": bool(vehicle.thrust_curve)}
     why = []
     for name in ("rotor_speed", "motor_command", "wrench_command"):
         if name not in recording.signals or not recording.signals[name].time.size:
             continue
         if _measured(recording, name) is None:
             why.append(f"{name} holds no numbers, or only zeros: no sensor is connected")
-        elif too_slow(recording, name):
-            why.append(too_slow(recording, name))
-        elif not laws.get(name, True):
-            why.append(_lawless(name, vehicle))
+        elif slow := too_slow(recording, name):
+            why.append(slow)
+        elif name in _THRUST_LAWS and not getattr(vehicle, law := _THRUST_LAWS[name]):
+            have = [preset for preset in preset_names() if getattr(load_vehicle(preset), law)]
+            no_law = f"{name} is recorded, but not the thrust it gives: vehicle {vehicle.name} has no {law}"
+            why.append(f"{no_law} (--vehicle {' or '.join(have)} has one)")
         else:
             return name, ""
     if why:
@@ -106,15 +104,6 @@ def _measured(recording: Recording, name: str) -> tuple[Array, Array] | None:
     found = None if array is None else sound_samples(array)
     unconnected = found is not None and name in ("rotor_speed", "voltage") and not found[1].any()
     return None if unconnected else found
-
-
-def _lawless(name: str, vehicle: Vehicle) -> str:
-    key = _THRUST_LAWS[name]
-    have = [preset for preset in preset_names() if getattr(load_vehicle(preset), key)]
-    return (
-        f"{name} is recorded, but not the thrust it gives: vehicle {vehicle.name} has no {key} "
-        f"(--vehicle {' or '.join(have)} has one)"
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,6 +1,7 @@
 """Signals from topics (named rows of numbers with times); shared by the readers of ULog, tlog and rosbag2."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,70 +19,58 @@ LONGEST_TEXT = 300  # characters of a metadata value that are kept
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Topic:
-    """Messages of one kind.
+    """Messages of one kind."""
 
-    Attributes:
-        name: becomes the `stream` of its signals; raw columns are called "<name>.<column>".
-        columns: column -> (n,) numbers, in the type in which they were stored.
-        time: (n,) s, on the time axis of the recording.
-        order: (n,) position of each row among the rows of all topics; a number occurs once.
-        host_time: (n,) s since the epoch, None where unknown.
-        clock: as in `SignalArray`.
-        units: column -> unit, where known.
-    """
+    name: str  # becomes the `stream` of its signals; raw columns are called "<name>.<column>"
+    columns: Mapping[str, NDArray[np.generic]]  # column -> (n,) numbers, in the type in which they were stored
+    time: NDArray[np.float64]  # (n,) s, on the time axis of the recording
+    order: NDArray[np.int64]  # (n,) position of each row among the rows of all topics; a number occurs once
+    host_time: NDArray[np.float64] | None = None  # (n,) s since the epoch, None where unknown
+    clock: str = ""  # as in `SignalArray`
+    units: Mapping[str, str] = field(default_factory=dict)  # column -> unit, where known
 
-    name: str
-    columns: Mapping[str, NDArray[np.generic]]
-    time: NDArray[np.float64]
-    order: NDArray[np.int64]
-    host_time: NDArray[np.float64] | None = None
-    clock: str = ""
-    units: Mapping[str, str] = field(default_factory=dict)
+    def source_of(self, column: str) -> str:
+        """The name of a column in the file."""
+        return f"{self.name}.{column}"
+
+    def raw_name(self, column: str, *, ambiguous: bool) -> str:
+        """The name of the signal of a column without a meaning; `ambiguous`: another topic has such a column, too."""
+        return self.source_of(column)
+
+    def unit_of(self, column: str) -> str:
+        """The unit of a column, "" where unknown."""
+        return self.units.get(column, "")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mapped:
-    """A signal of the vocabulary, made from columns of a topic.
+    """A signal of the vocabulary, made from columns of a topic."""
 
-    Attributes:
-        quantity: key of `SIGNALS`.
-        value: (n, c) SI.
-        columns: names of the source columns.
-        marked: (n,) True where the reader set NaN because the file says that the value is invalid; None: nowhere.
-        frame: the frame, if known better than in `SIGNALS`.
-        origin: "" for a candidate for the signal itself, a name such as "mocap" for a further measurement.
-    """
-
-    quantity: str
+    quantity: str  # key of `SIGNALS`
     topic: Topic
-    value: NDArray[np.float64]
-    columns: tuple[str, ...]
+    value: NDArray[np.float64]  # (n, c) SI
+    columns: tuple[str, ...]  # names of the source columns
+    # (n,) True where the reader set NaN because the file says that the value is invalid; None: nowhere
     marked: NDArray[np.bool_] | None = None
-    frame: str = ""
-    origin: str = ""
+    frame: str = ""  # the frame, if known better than in `SIGNALS`
+    origin: str = ""  # "" for a candidate for the signal itself, a name such as "mocap" for a further measurement
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Which columns of a topic give a signal of the vocabulary; a reader has a table of these, the best source first.
-
-    Attributes:
-        convert: function from c columns of (n,) to (n, c) SI.
-        invalid: function that returns (n,) True in rows that the message declares invalid; they become missing.
-        absent_is_nan: the format uses NaN for "no value".
-        zero_is_absent: 0 in every row means that no sensor is connected; the columns then stay raw.
-        frame, origin: as in `Mapped`.
-    """
+    """Which columns of a topic give a signal of the vocabulary; a reader has a table of these, the best first."""
 
     quantity: str
     topic: str
     columns: tuple[str, ...]
+    # function from c columns of (n,) to (n, c) SI
     convert: Callable[[Sequence[NDArray[np.generic]]], NDArray[np.float64]]
+    # function that returns (n,) True in rows that the message declares invalid; they become missing
     invalid: Callable[[Topic], NDArray[np.bool_]] | None = None
-    absent_is_nan: bool = False
-    frame: str = ""
+    absent_is_nan: bool = False  # the format uses NaN for "no value"
+    frame: str = ""  # frame, origin: as in `Mapped`
     origin: str = ""
-    zero_is_absent: bool = False
+    zero_is_absent: bool = False  # 0 in every row means that no sensor is connected; the columns then stay raw
 
     def of(self, topics: Sequence[Topic]) -> Iterator[Mapped]:
         """The signal, from each topic that has the name and the columns."""
@@ -155,58 +144,53 @@ def ranks(times: Sequence[NDArray[np.generic]]) -> list[NDArray[np.int64]]:
     return np.split(place, np.cumsum(sizes)[:-1]) if times else []
 
 
-def signals_of(topics: Sequence[Topic], mapped: Sequence[Mapped]) -> tuple[dict[str, SignalArray], list[Finding]]:
+def signals_of(
+    topics: Sequence[Topic], mapped: Sequence[Mapped], *, bounded: bool = True
+) -> tuple[dict[str, SignalArray], list[Finding]]:
     """Signals by name, and findings about columns that were left out.
 
     Args:
         topics: all of the recording.
         mapped: best first; the first of a quantity gets its name, the others are called "<quantity>@<topic>".
+        bounded: leave out columns without a meaning beyond `MOST_RAW_SIGNALS` and `MOST_RAW_SAMPLES`.
 
-    Returns: first the signals of the vocabulary, then every unused column as "<topic>.<column>"; and the findings.
+    Returns: first the signals of the vocabulary, then every unused column by `Topic.raw_name`; and the findings.
     """
-    mapped = [m for m in mapped if m.topic.time.size]
+    mapped = [m for m in mapped if m.topic.time.size or not bounded]
     used = {(id(m.topic), column) for m in mapped for column in m.columns}
-    raw, left_out = _within_bounds([(t, c) for t in topics for c in t.columns if (id(t), c) not in used])
-    step = len(mapped) + len(raw)  # places for all signals of a row, so that orders are unique
-    unmarked = {id(t): np.zeros(t.time.size, bool) for t in topics}
+    raw = [(t, c) for t in topics for c in t.columns if (id(t), c) not in used]
+    raw, left_out = _within_bounds(raw) if bounded else (raw, [])
+    # places for all signals of a row, so that orders are unique; unbounded columns without a meaning share one place,
+    # to save memory
+    step = len(mapped) + (len(raw) if bounded else 1)
     hosts = {id(t): np.full(t.time.size, np.nan) if t.host_time is None else t.host_time for t in topics}
+    unmarked = {id(t): np.zeros(t.time.size, bool) for t in topics}
+    shared = {id(t): t.order * step + len(mapped) for t in topics if not bounded}
     found: dict[str, SignalArray] = {}
     for place, m in enumerate(mapped):
+        topic, (_, unit, frame) = m.topic, SIGNALS[m.quantity]
         name = f"{m.quantity}@{m.origin}" if m.origin else m.quantity
-        if name in found:
-            name = f"{m.quantity}@{m.topic.name}"
-        while name in found:
-            name += "'"
-        found[name] = SignalArray(
-            m.topic.time,
-            m.value,
-            m.topic.order * step + place,
-            hosts[id(m.topic)],
-            unmarked[id(m.topic)] if m.marked is None else m.marked & ~np.isfinite(m.value).all(axis=1),
-            quantity=m.quantity,
-            unit=SIGNALS[m.quantity][1],
-            frame=m.frame or SIGNALS[m.quantity][2],
-            clock=m.topic.clock,
-            stream=m.topic.name,
-            source=tuple(f"{m.topic.name}.{c}" for c in m.columns),
-        )
+        name = _unique(f"{m.quantity}@{topic.name}" if name in found else name, found)
+        marked = unmarked[id(topic)] if m.marked is None else m.marked & ~np.isfinite(m.value).all(axis=1)
+        order, source = topic.order * step + place, tuple(map(topic.source_of, m.columns))
+        about = (m.quantity, unit, m.frame or frame, topic.clock, topic.name, source)
+        found[name] = SignalArray(topic.time, m.value, order, hosts[id(topic)], marked, *about)
     signals = {name: found[name] for name in sorted(found, key=lambda name: list(SIGNALS).index(name.split("@")[0]))}
+    times = Counter(column for _, column in raw)
     for place, (topic, column) in enumerate(raw, start=len(mapped)):
-        name = f"{topic.name}.{column}"
-        while name in signals:  # two topics of one name: in damaged files, or "a_1" beside the second "a"
-            name += "'"
-        signals[name] = SignalArray(
-            topic.time,
-            floats(topic.columns[column])[:, None],
-            topic.order * step + place,
-            hosts[id(topic)],
-            unmarked[id(topic)],
-            unit=topic.units.get(column, ""),
-            clock=topic.clock,
-            stream=topic.name,
-            source=(f"{topic.name}.{column}",),
-        )
+        # two topics of one name: in damaged files, or "a_1" beside the second "a"
+        name = _unique(topic.raw_name(column, ambiguous=times[column] > 1), signals)
+        value, key = floats(topic.columns[column])[:, None], id(topic)
+        about = ("", topic.unit_of(column), "", topic.clock, topic.name, (topic.source_of(column),))
+        order = topic.order * step + place if bounded else shared[key]
+        signals[name] = SignalArray(topic.time, value, order, hosts[key], unmarked[key], *about)
     return signals, left_out
+
+
+def _unique(name: str, taken: Container[str]) -> str:
+    while name in taken:
+        name += "'"
+    return name
 
 
 def _within_bounds(raw: list[tuple[Topic, str]]) -> tuple[list[tuple[Topic, str]], list[Finding]]:

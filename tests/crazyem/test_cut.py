@@ -13,9 +13,8 @@ from recording_files import joined
 from crazyem.cli import main
 from crazyem.errors import UsageError
 from crazyem.recordings import Event, Finding, Fix, Grade, ReadOptions, Recording, SignalArray, open_recording
-from crazyem.recordings.cut import cut, cut_parts
 from crazyem.recordings.export import METADATA_SUFFIX, export
-from crazyem.recordings.parts import open_parts
+from crazyem.recordings.registry import cut, cut_parts, open_parts
 
 
 def array(time: np.ndarray, stream: str = "s") -> SignalArray:

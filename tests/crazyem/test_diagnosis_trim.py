@@ -29,8 +29,8 @@ from crazyem.diagnosis.naming.detection_limits import usual_gusts
 from crazyem.diagnosis.naming.steady_odds import explanations
 from crazyem.diagnosis.settings import FITTING
 from crazyem.recordings import open_recording
-from crazyem.recordings.cut import cut
 from crazyem.recordings.recording import Recording
+from crazyem.recordings.registry import cut
 from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
 
 TRIMMED = replace(DRONE, effects={TRIM: {"x": 1e-4, "y": -2e-4, "z": 3e-4}, "linear_drag": {"x": 0.01}})

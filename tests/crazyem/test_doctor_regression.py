@@ -7,8 +7,7 @@ from made_flight import Motion, array_of
 from scipy.spatial.transform import Rotation
 
 from crazyem.doctor import kinematics, regression
-from crazyem.doctor.delays import delay, spread
-from crazyem.doctor.kinematics import Grid, Track, Window
+from crazyem.doctor.kinematics import Grid, Track, Window, delay, spread
 from crazyem.physics.rotations import euler_from_quaternion, rotate
 
 

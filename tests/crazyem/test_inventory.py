@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from made_flight import Motion, array_of, changed, made_flight, without
 from synthetic import COLUMNS, Truth, fly
 
-from crazyem.doctor.envelope import envelope
 from crazyem.doctor.excitation import rotation_fit, steps_of
 from crazyem.doctor.identifiability import VERDICT_NAMES, Verdict, replay_objection
-from crazyem.doctor.inventory import Inventory, inventory
+from crazyem.doctor.inventory import Inventory, envelope, inventory
 from crazyem.recordings import Recording, open_recording
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.thrust import inputs_of

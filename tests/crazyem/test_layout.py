@@ -13,7 +13,7 @@ from crazyem.commands import layout as command
 from crazyem.errors import UsageError
 from crazyem.recordings.mcap import schemas
 from crazyem.recordings.mcap.layout import foxglove_layout, swarm_layout
-from crazyem.recordings.mcap.messages import EVENT_TOPICS
+from crazyem.recordings.mcap.schemas import EVENT_TOPICS
 from crazyem.signals.vocabulary import MOTOR_BLOCK, ROTOR_SPEED_BLOCK, block_plan
 
 PATH = re.compile(r"(?P<topic>(?:/\w+)+)\.(?P<fields>.+)")

@@ -11,7 +11,7 @@ from mcap_sessions import MAGIC, STATE, chunks, packets, record, small_fixture, 
 
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings import open_recording
-from crazyem.recordings.mcap.append import reopen
+from crazyem.recordings.mcap.output import reopen
 from crazyem.recordings.mcap.recover import recover
 from crazyem.recordings.mcap.signals import write_recording
 from crazyem.recordings.mcap.writer import RecordingWriter

@@ -292,9 +292,7 @@ def test_stamps_of_version_1_go_on_where_they_wrap(put, monkeypatch):
     assert times["x"] == [2**32 - 10, 2**32, 2**32 + 5]
 
 
-def test_long_runs_cross_the_window_of_a_comparison(put, monkeypatch):
-    monkeypatch.setattr("crazyem.recordings.usd.format._WINDOW_RECORDS", 64)
-    monkeypatch.setattr("crazyem.recordings.usd.format._GATHERED_BYTES", 1024)
+def test_long_runs_of_one_kind(put, monkeypatch):
     events = [(FIXED, "fixedFrequency", [("a.b", "H")]), (2, "other", [("x", "B")])]
     lengths = [1, 15, 16, 17, 63, 64, 65, 80, 128, 129, 300]
     kinds = [k % 2 for k, n in enumerate(lengths) for _ in range(n)]

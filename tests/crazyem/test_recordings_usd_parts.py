@@ -11,14 +11,14 @@ from test_recordings_usd import FIXED, header, log, logs, record, small_log
 
 from crazyem.errors import CrazyemError, FileFormatError
 from crazyem.recordings import ReadOptions, Recording
-from crazyem.recordings.parts import open_parts
+from crazyem.recordings.registry import open_parts
 from crazyem.recordings.usd.file import read, read_parts
 
 
 @pytest.fixture(autouse=True)
 def small_pieces(monkeypatch):
     """Records lie across pieces, often."""
-    monkeypatch.setattr("crazyem.recordings.usd.stretches._READ_BYTES", 37)
+    monkeypatch.setattr("crazyem.recordings.usd.file._READ_BYTES", 37)
 
 
 def words(findings):
@@ -97,12 +97,12 @@ def test_all_parts_agree_on_the_motors(tmp_path, kind, monkeypatch):
         rows.append((0, 10_000 * i, values if i > 1000 else [0] * 4))
     path = tmp_path / "log"
     path.write_bytes(log(2, events, rows))
-    monkeypatch.setattr("crazyem.recordings.usd.stretches._READ_BYTES", 5000)
+    monkeypatch.setattr("crazyem.recordings.usd.file._READ_BYTES", 5000)
     whole = read(path, ReadOptions())
     assert whole.metadata["motor"]["meaning"] == kind
     assert_joined(list(read_parts(path, ReadOptions(), seconds=5.0)), whole)
     # from a share of the rows: the same verdict, other numbers
-    monkeypatch.setattr("crazyem.recordings.usd.stretches._SAMPLED_ROWS", 500)
+    monkeypatch.setattr("crazyem.recordings.usd.file._SAMPLED_ROWS", 500)
     parts = list(read_parts(path, ReadOptions(), seconds=5.0))
     assert {part.metadata["motor"]["meaning"] for part in parts} == {kind}
     assert [set(part.signals) for part in parts] == [set(whole.signals)] * len(parts)
@@ -144,6 +144,6 @@ def test_a_header_longer_than_a_piece_and_one_that_never_ends(tmp_path, monkeypa
     path = tmp_path / "log"
     parts_like_the_whole(header(2, events) + record(2, events[0], 5, [1] * 50) + bytes(4), path, 60.0)
     path.write_bytes(b"\xbc\x02\x00\x01\x00\xff\xff" + bytes([255]) * 100_000)
-    monkeypatch.setattr("crazyem.recordings.usd.stretches._LONGEST_HEADER", 1000)
+    monkeypatch.setattr("crazyem.recordings.usd.file._LONGEST_HEADER", 1000)
     with pytest.raises(FileFormatError, match="not text"):
         list(read_parts(path, ReadOptions()))

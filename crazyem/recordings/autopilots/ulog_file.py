@@ -21,7 +21,6 @@ from crazyem.recordings.autopilots.frd_ned import (
     BODY,
     MOTORS,
     WORLD,
-    Columns,
     angles_of_quaternions,
     euler,
     quaternions,
@@ -34,7 +33,7 @@ from crazyem.recordings.autopilots.ulog_scan import HEADER_BYTES, ULOG_MAGIC, Sc
 from crazyem.recordings.contents import ReadOptions, contents
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import Recording
-from crazyem.recordings.stamps import Fault, believed, finding_in
+from crazyem.recordings.stamps import Fault, believed, finding
 from crazyem.recordings.topics import Source, Topic, damage, named, ranks, seconds, signals_of, text_of, unconnected
 from crazyem.signals.mavlink import RPM_IN_RAD_PER_S
 
@@ -73,7 +72,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
     mapped = [m for source in _ULOG_SIGNALS for m in source.of(topics)]
     signals, left_out = signals_of(topics, mapped)
     absent, unplugged = unconnected(topics, _ULOG_SIGNALS, signals)
-    findings = [*_integrity(sound, topics, log), *finding_in(faults, signals), *left_out]
+    findings = [*_integrity(sound, topics, log), *finding(faults, signals), *left_out]
     findings += [*unplugged, *_notes(signals)]
     metadata = _metadata(log) | {"vehicle": vehicle_of(_kind(log)), "not_measured": absent}
     return Recording(str(path), "ulog", signals, {k: v for k, v in metadata.items() if v}, tuple(findings))
@@ -168,10 +167,6 @@ def _other_frame(topic: Topic) -> NDArray[np.bool_]:
     return np.ones(topic.time.size, bool) if frame is None else frame != 1
 
 
-def _not(columns: Columns) -> NDArray[np.float64]:
-    return (stacked(columns) == 0).astype(float)
-
-
 def _odometry(topic: str, origin: str) -> tuple[Source, Source]:
     """Pose from an external source, in rows that are in NED."""
     place, turn = named("position[*]", _THREE), named("q[*]", _FOUR)
@@ -201,7 +196,13 @@ _ULOG_SIGNALS: tuple[Source, ...] = (
     Source("voltage", "battery_status", ("voltage_v",), stacked, zero_is_absent=True),
     Source("setpoint_position", _TARGET, _XYZ, vectors, absent_is_nan=True, frame=WORLD),
     Source("setpoint_velocity", _TARGET, named("*", "vx vy vz"), vectors, absent_is_nan=True, frame=WORLD),
-    Source("flying", "vehicle_land_detected", ("landed",), _not, frame="1 while the autopilot does not say landed"),
+    Source(
+        "flying",
+        "vehicle_land_detected",
+        ("landed",),
+        lambda c: 1.0 - (stacked(c) != 0),
+        frame="1 while the autopilot does not say landed",
+    ),
     Source("acceleration", _LOCAL, named("*", "ax ay az"), vectors, _valid("v_xy_valid", "v_z_valid"), frame=WORLD),
     Source("motor_request", "actuator_motors", named("control[*]", _FOUR), stacked, absent_is_nan=True, frame=MOTORS),
     Source(

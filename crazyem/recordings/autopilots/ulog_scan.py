@@ -31,23 +31,16 @@ _KEY = re.compile(rb"(\w+)(?:\[(\d{1,10})\])? [^\x00-\x1f]+\Z")
 
 @dataclass(slots=True)
 class Scan:
-    """Result of the scan of a file.
+    """Result of the scan of a file."""
 
-    Attributes:
-        data: header and all sound messages; the file itself if all of it is sound.
-        skipped: (offset, count) of each run of bytes that is no sound message.
-        refused: name of a topic that is not read -> reason.
-        messages: number of sound messages.
-        identifiers: identifier of the topic of each sound data message, in the order of the file.
-        size: of the file, bytes.
-    """
-
-    data: bytes = b""
+    data: bytes = b""  # header and all sound messages; the file itself if all of it is sound
+    # (offset, count) of each run of bytes that is no sound message
     skipped: list[tuple[int, int]] = field(default_factory=list)
-    refused: dict[str, str] = field(default_factory=dict)
-    messages: int = 0
+    refused: dict[str, str] = field(default_factory=dict)  # name of a topic that is not read -> reason
+    messages: int = 0  # number of sound messages
+    # identifier of the topic of each sound data message, in the order of the file
     identifiers: "array[int]" = field(default_factory=lambda: array("H"))
-    size: int = 0
+    size: int = 0  # of the file, bytes
 
 
 class _Types:

@@ -7,7 +7,9 @@ Python prints them, so every float is exact. Rows are in order of arrival; the f
 """
 
 import contextlib
+import io
 import re
+from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -23,7 +25,7 @@ from crazyem.recordings.contents import ReadOptions, contents, head_of
 from crazyem.recordings.csv.file import read as read_csv
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import Recording
-from crazyem.recordings.stamps import Fault, finding_in
+from crazyem.recordings.stamps import Fault, finding
 from crazyem.recordings.tables import Table, signals_from_tables
 from crazyem.recordings.topics import ranks
 
@@ -38,22 +40,14 @@ _RECORDING_SUFFIXES = {"", ".mcap", ".ulg", ".tlog", ".db3", ".parquet"}  # suff
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Part:
-    """One file.
-
-    Attributes:
-        block: name of the log block; the file name if it does not follow the pattern of cfclient.
-        date: start of writing, local time of the host; None if not in the file name.
-        variables: names of the columns.
-        stamp: (n,) ms, unwrapped from the first.
-        values: (n, k).
-    """
+    """One file."""
 
     path: Path
-    block: str
-    date: datetime | None
-    variables: tuple[str, ...]
-    stamp: NDArray[np.int64]
-    values: NDArray[np.float64]
+    block: str  # name of the log block; the file name if it does not follow the pattern of cfclient
+    date: datetime | None  # start of writing, local time of the host; None if not in the file name
+    variables: tuple[str, ...]  # names of the columns
+    stamp: NDArray[np.int64]  # (n,) ms, unwrapped from the first
+    values: NDArray[np.float64]  # (n, k)
 
 
 def recognises(head: bytes) -> bool:
@@ -106,13 +100,19 @@ def read(path: Path, options: ReadOptions) -> Recording:
         if not part.stamp.size:
             findings.append(note("integrity", f"{part.path.name} has a header and not a single row."))
     if not folder:
-        _mention_siblings(path, findings)
+        with contextlib.suppress(OSError, UsageError):
+            others = len(_files(path.parent)) - 1
+            if 0 < others < _MOST_SIBLINGS and recognises_folder(path.parent):
+                text = f"{others} more files of the session lie beside it; read the folder to have them too."
+                findings.append(note("integrity", text, files=others))
     full = _aligned(full)
     tables = _tables(full)
-    metadata = {"cfclient": _metadata(path, full)}
+    section = {"session": path.name if folder else path.parent.name}
+    section |= {f"file.{part.path.name}": f"{part.block}: {' '.join(part.variables)}" for part in full}
+    metadata = {"cfclient": section}
     meaning = motor_meaning.decide(tables, given=options.motor, metadata=metadata)
     signals = signals_from_tables(tables, motor=meaning.meaning)
-    findings += finding_in(faults, signals)
+    findings += finding(faults, signals)
     return Recording(str(path), "csv:cfclient", signals, metadata | meaning.metadata, (*findings, *meaning.findings))
 
 
@@ -237,40 +237,21 @@ def _segments(
 
 def _numbers(path: Path, text: bytes, width: int, line: int) -> NDArray[np.float64]:
     """(n, width) of comma-separated text whose first line is number `line` of the file."""
-    if not text.strip():
-        return np.empty((0, width))
-    from pyarrow import ArrowInvalid, csv, float64, py_buffer
-
-    names = [str(i) for i in range(width)]
-    try:
-        table = csv.read_csv(
-            py_buffer(text),
-            csv.ReadOptions(column_names=names, use_threads=False),
-            csv.ParseOptions(quote_char=False),
-            csv.ConvertOptions(column_types=dict.fromkeys(names, float64()), null_values=[], strings_can_be_null=False),
-        )
-    except ArrowInvalid:
-        return _plain_numbers(path, text, width, line)
-    return np.column_stack([table.column(name).to_numpy() for name in names])
-
-
-def _plain_numbers(path: Path, text: bytes, width: int, line: int) -> NDArray[np.float64]:
-    """As `_numbers`, row by row, so that an error names its line."""
-    rows = []
-    for number, row in enumerate(text.split(b"\n"), start=line):
+    numbers = array("d")
+    for number, row in enumerate(io.BytesIO(text), start=line):
         if not row.strip():
             continue
-        fields = row.decode("latin-1").split(",")
+        fields = row.rstrip(b"\n").split(b",")
         if len(fields) != width:
             raise FileFormatError(f"{path}: line {number} has {len(fields)} fields, the header has {width}.")
         try:
-            if "_" in "".join(fields):
+            if b"_" in row:
                 raise ValueError
-            rows.append([float(field) for field in fields])
+            numbers.extend(map(float, fields))
         except ValueError:
-            shown = ascii(row[:40].decode("latin-1"))
+            shown = ascii(row[:40].decode("latin-1").rstrip("\n"))
             raise FileFormatError(f"{path}: line {number} holds something that is not a number: {shown}.") from None
-    return np.array(rows, float).reshape(len(rows), width)
+    return np.array(numbers, float).reshape(-1, width)
 
 
 def _unwrapped(stamp: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -310,18 +291,3 @@ def _tables(parts: Sequence[_Part]) -> list[Table]:
         columns = {variable: values[:, i] for i, variable in enumerate(variables)}
         tables.append(Table(name, columns, stamp / 1000.0, order))
     return tables
-
-
-def _mention_siblings(path: Path, findings: list[Finding]) -> None:
-    with contextlib.suppress(OSError, UsageError):
-        others = len(_files(path.parent)) - 1
-        if 0 < others < _MOST_SIBLINGS and recognises_folder(path.parent):
-            text = f"{others} more files of the session lie beside it; read the folder to have them too."
-            findings.append(note("integrity", text, files=others))
-
-
-def _metadata(path: Path, parts: Sequence[_Part]) -> dict[str, str]:
-    section = {"session": path.name if path.is_dir() else path.parent.name}
-    for part in parts:
-        section[f"file.{part.path.name}"] = f"{part.block}: {' '.join(part.variables)}"
-    return section

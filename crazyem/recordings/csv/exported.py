@@ -15,16 +15,13 @@ from crazyem.errors import FileFormatError
 from crazyem.recordings.columns import MARKED_COLUMN, Description, SignalEntry, name_and_unit
 from crazyem.recordings.contents import GrowingArray, ReadOptions
 from crazyem.recordings.csv.text import BLOCK_BYTES, LONGEST_LINE, Damage, text_blocks
-from crazyem.recordings.csv.wide import damage_notes
-from crazyem.recordings.description import from_json
-from crazyem.recordings.export import HOST_TIME, METADATA_SUFFIX, TIME
+from crazyem.recordings.export import HOST_TIME, METADATA_SUFFIX, TIME, from_json
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.recording import Recording, SignalArray
+from crazyem.recordings.ordering import Array
+from crazyem.recordings.recording import Recording, SignalArray, about
 from crazyem.signals.sample import SIGNALS, components
 
 _LARGEST_DESCRIPTION = 256 << 20  # bytes
-
-Floats = NDArray[np.float64]
 
 
 def recognises(head: bytes) -> bool:
@@ -45,15 +42,24 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
 def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Iterator[Recording]:
     """Consecutive parts of at least `seconds` of an exported recording; the first has the events."""
-    table = _Table(path)
-    held = _Held(table.description.entries)
-    for batch, first in table.batches():
+    findings: list[Finding] = []
+    titles = _titles(path)
+    known = _description(path, titles, findings)
+
+    def recording() -> Recording:
+        if not held.time.size:
+            raise FileFormatError(f"{path}: there is a header but not a single sample.")
+        found, events = (*known.findings, *findings), known.events if held.first == 0 else ()
+        return Recording(str(path), known.source, held.signals(), known.metadata or {}, found, events, known.origin)
+
+    held = _Held(known.entries)
+    for batch, first in _batches(path, titles, findings):
         held.add(batch, first, path)
         if not float(held.time.rows[-1]) - float(held.time.rows[0]) < seconds:
-            yield table.recording(held)
-            held = _Held(table.description.entries, held.first + held.time.size)
+            yield recording()
+            held = _Held(known.entries, held.first + held.time.size)
     if held.time.size or not held.first:
-        yield table.recording(held)
+        yield recording()
 
 
 class _Held:
@@ -82,81 +88,53 @@ class _Held:
         for place, entry in enumerate(self.entries):
             parts = [batch.column(column + i) for i in range(len(entry.components))]
             column += len(parts)
-            row = _rows_with(parts, count)
+            row = np.arange(count)  # the rows in which at least one of the columns has a value
+            if all(part.null_count for part in parts):
+                valid = [p.is_valid().to_numpy(zero_copy_only=False) for p in parts]
+                row = np.flatnonzero(np.logical_or.reduce(valid))
             value = self.value[place].more(row.size)
             for i, part in enumerate(parts):
                 value[:, i] = part.to_numpy(zero_copy_only=False)[row]
             self.order[place].more(row.size)[:] = (row + before) * len(self.entries) + place
-            marked = self.marked[place].more(row.size)
-            if entry.marked:
-                marked[:] = batch.column(column).to_numpy(zero_copy_only=False)[row] == 1.0
-                column += 1
-            else:
-                marked[:] = False
+            flags = batch.column(column).to_numpy(zero_copy_only=False)[row] == 1.0 if entry.marked else False
+            self.marked[place].more(row.size)[:] = flags
+            column += entry.marked
 
     def signals(self) -> dict[str, SignalArray]:
         """The signals; those of one stream share their stamps."""
         signals: dict[str, SignalArray] = {}
-        shared: list[tuple[NDArray[np.int64], int, Floats, Floats]] = []
+        shared: list[tuple[NDArray[np.int64], int, Array, Array]] = []
         for place, entry in enumerate(self.entries):
             order = self.order[place].rows
             # same rows: the orders differ only by the places of the signals
             known = next((k for k in shared if k[0].size == order.size and (order - k[0] == place - k[1]).all()), None)
             if known is None:
-                known = (order, place, self._of(self.time, order), self._of(self.host_time, order))
+                every = order.size == self.time.size
+                rows = slice(None) if every else order // len(self.entries) - self.first
+                known = (order, place, self.time.rows[rows], self.host_time.rows[rows])
                 shared.append(known)
-            signals[entry.name] = SignalArray(
-                known[2],
-                self.value[place].rows,
-                order,
-                known[3],
-                self.marked[place].rows,
-                quantity=entry.quantity,
-                unit=entry.unit,
-                frame=entry.frame,
-                clock=entry.clock,
-                stream=entry.stream,
-                source=entry.source,
-            )
+            value, marked = self.value[place].rows, self.marked[place].rows
+            signals[entry.name] = SignalArray(known[2], value, order, known[3], marked, **about(entry))
         return signals
 
-    def _of(self, stamps: GrowingArray, order: NDArray[np.int64]) -> Floats:
-        """Stamps of the rows in which a signal has samples."""
-        if order.size == stamps.size:
-            return stamps.rows
-        return stamps.rows[order // len(self.entries) - self.first]
+
+def _titles(path: Path) -> list[str]:
+    """The titles of the columns."""
+    line = next(text_blocks(path, Damage(), size=LONGEST_LINE), b"").partition(b"\n")[0]
+    try:
+        titles = next(csv.reader([line.decode("utf-8-sig")], strict=True), [])
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise FileFormatError(f"{path}: line 1 is not a CSV header ({error}).") from None
+    if titles[:2] != [TIME, HOST_TIME] or len(titles) < 3:
+        raise FileFormatError(f"{path}: line 1 is not the header of an exported recording.")
+    return titles
 
 
-def _rows_with(parts: list[Any], count: int) -> NDArray[np.int64]:
-    """Rows in which at least one of some columns has a value."""
-    if any(not part.null_count for part in parts):
-        return np.arange(count)
-    return np.flatnonzero(np.logical_or.reduce([p.is_valid().to_numpy(zero_copy_only=False) for p in parts]))
-
-
-class _Table:
-    """The file, read in blocks of rows, with the description of its columns."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.findings: list[Finding] = []
-        self.titles = self._header()
-        self.description = self._description()
-
-    def _header(self) -> list[str]:
-        line = next(text_blocks(self.path, Damage(), size=LONGEST_LINE), b"").partition(b"\n")[0]
-        try:
-            titles = next(csv.reader([line.decode("utf-8-sig")], strict=True), [])
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise FileFormatError(f"{self.path}: line 1 is not a CSV header ({error}).") from None
-        if titles[:2] != [TIME, HOST_TIME] or len(titles) < 3:
-            raise FileFormatError(f"{self.path}: line 1 is not the header of an exported recording.")
-        return titles
-
-    def _description(self) -> Description:
-        beside = self.path.with_name(self.path.name.removesuffix(".gz") + METADATA_SUFFIX)
-        if not beside.is_file():
-            return self._guessed(f"There is no {beside.name} beside it: frames, clocks and streams are not known.")
+def _description(path: Path, titles: list[str], findings: list[Finding]) -> Description:
+    """The description beside the file; without it signals from the titles alone, and a finding with the reason."""
+    beside = path.with_name(path.name.removesuffix(".gz") + METADATA_SUFFIX)
+    why = f"There is no {beside.name} beside it: frames, clocks and streams are not known."
+    if beside.is_file():
         try:
             if beside.stat().st_size > _LARGEST_DESCRIPTION:
                 raise ValueError("it is too large")
@@ -165,58 +143,40 @@ class _Table:
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError, StopIteration) as error:
             what = f"{type(error).__name__}: {error}" if isinstance(error, KeyError | TypeError) else str(error)
             raise FileFormatError(f"{beside} is not the description of an exported recording ({what}).") from None
-        if [c.title for c in description.columns] != self.titles[2:]:
-            return self._guessed(f"{beside.name} describes other columns than the file has; it was left out.")
-        return description
+        if [c.title for c in description.columns] == titles[2:]:
+            return description
+        why = f"{beside.name} describes other columns than the file has; it was left out."
+    findings.append(note("integrity", why, Grade.DEGRADES))
+    return _guessed(titles[2:])
 
-    def _guessed(self, why: str) -> Description:
-        """Signals from the titles of their columns alone, and a finding with the reason."""
-        self.findings.append(note("integrity", why, Grade.DEGRADES))
-        return _guessed(self.titles[2:])
 
-    def batches(self) -> Iterator[tuple[Any, int]]:
-        """The rows of the file, in bounded memory: (RecordBatch, line of its first row).
+def _batches(path: Path, titles: list[str], findings: list[Finding]) -> Iterator[tuple[Any, int]]:
+    """The rows of the file, in bounded memory: (RecordBatch, line of its first row).
 
-        Raises FileFormatError naming line or column.
-        """
-        import pyarrow as pa
-        from pyarrow import csv as pa_csv
+    Raises FileFormatError naming line or column.
+    """
+    import pyarrow as pa
+    from pyarrow import csv as pa_csv
 
-        names = [str(i) for i in range(len(self.titles))]
-        reading = pa_csv.ReadOptions(column_names=names, block_size=2 * BLOCK_BYTES, use_threads=False)
-        converting = pa_csv.ConvertOptions(column_types=dict.fromkeys(names, pa.float64()), null_values=[""])
-        damage = Damage()
-        first, header = 2, True
-        # in blocks, not as one stream, whose read-ahead threads would keep each block in memory
-        for block in text_blocks(self.path, damage):
-            rows = block.partition(b"\n")[2] if header else block
-            header = False
-            if not rows.strip():
-                continue
-            try:
-                table = pa_csv.read_csv(pa.py_buffer(rows), reading, convert_options=converting)
-            except pa.ArrowException as error:
-                why = str(error).strip().rstrip(".")[:200]
-                raise FileFormatError(f"{self.path}: a line cannot be read ({why}).") from None
-            for batch in table.to_batches():
-                yield batch, first
-                first += batch.num_rows
-        self.findings += damage_notes(damage)
-
-    def recording(self, held: _Held) -> Recording:
-        """The recording from some consecutive rows."""
-        if not held.time.size:
-            raise FileFormatError(f"{self.path}: there is a header but not a single sample.")
-        known_of = self.description
-        return Recording(
-            str(self.path),
-            known_of.source,
-            held.signals(),
-            known_of.metadata or {},
-            (*known_of.findings, *self.findings),
-            known_of.events if held.first == 0 else (),
-            known_of.origin,
-        )
+    names = [str(i) for i in range(len(titles))]
+    reading = pa_csv.ReadOptions(column_names=names, block_size=2 * BLOCK_BYTES, use_threads=False)
+    converting = pa_csv.ConvertOptions(column_types=dict.fromkeys(names, pa.float64()), null_values=[""])
+    damage = Damage()
+    first = 2
+    # in blocks, not as one stream, whose read-ahead threads would keep each block in memory
+    for number, block in enumerate(text_blocks(path, damage)):
+        rows = block if number else block.partition(b"\n")[2]
+        if not rows.strip():
+            continue
+        try:
+            table = pa_csv.read_csv(pa.py_buffer(rows), reading, convert_options=converting)
+        except pa.ArrowException as error:
+            why = str(error).strip().rstrip(".")[:200]
+            raise FileFormatError(f"{path}: a line cannot be read ({why}).") from None
+        for batch in table.to_batches():
+            yield batch, first
+            first += batch.num_rows
+    findings += damage.findings()
 
 
 def _guessed(titles: list[str]) -> Description:

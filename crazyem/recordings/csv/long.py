@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,6 @@ from crazyem.links.clock import StampUnwrapper
 from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.csv.mapping import CsvMapping, SignalColumns
 from crazyem.recordings.csv.text import Damage, Header, parse_fields, text_blocks, to_number
-from crazyem.recordings.csv.wide import damage_notes
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.recording import Recording, SignalArray
@@ -24,16 +23,8 @@ _LARGEST_STAMP = 2.0**53  # ms
 
 # (block, variables) -> time, order, host time and values of each packet, in order of arrival
 _Packets = dict[tuple[str, tuple[str, ...]], list[tuple[float, int, float, list[float]]]]
-
-
-@dataclass(slots=True)
-class _Packet:
-    """Consecutive rows with the same block, stamp and time of arrival."""
-
-    line: int
-    key: tuple[str, str, str]
-    names: list[str]
-    values: list[float]
+# consecutive rows with the same block, stamp and time of arrival: first line; these texts; names and values
+_Packet = tuple[int, tuple[str, str, str], list[str], list[float]]
 
 
 def read_long(path: Path, header: Header, mapping: CsvMapping, options: ReadOptions) -> Recording:
@@ -51,7 +42,7 @@ def read_long(path: Path, header: Header, mapping: CsvMapping, options: ReadOpti
     if not tables:
         raise FileFormatError(f"{path}: there is a header but not a single sample.")
     torn = sum(most.values()) - sum(most[key] for key in layouts.items())
-    findings: list[Finding] = damage_notes(damage)
+    findings: list[Finding] = damage.findings()
     if torn:
         text = f"{torn} packets were incomplete and were dropped."
         grade = Grade.DEGRADES if 100 * torn > sum(most.values()) else Grade.HARMLESS
@@ -77,25 +68,20 @@ def _collected(path: Path, header: Header, mapping: CsvMapping, damage: Damage) 
     unwrapper = StampUnwrapper()
     now = math.nan
     for order, packet in enumerate(_packets(path, header, mapping, damage)):
-        host_text, block, stamp_text = packet.key
-        try:
-            host_time = to_number(host_text)
-        except ValueError:
-            damage.drop(packet.line, f'line {packet.line}: "{host_text[:20]}" is not a number')
+        line, (host_text, block, stamp_text), names, values = packet
+        host_time, stamp = _number_or_none(host_text), _number_or_none(stamp_text)
+        if host_time is None:
+            damage.drop(line, f'line {line}: "{host_text[:20]}" is not a number')
             continue
-        if not host_variables.issuperset(packet.names):
-            try:
-                stamp = to_number(stamp_text)
-            except ValueError:
-                stamp = math.nan
-            if not abs(stamp) < _LARGEST_STAMP:
-                damage.drop(packet.line, f'line {packet.line}: "{stamp_text[:20]}" is not a firmware stamp')
+        if not host_variables.issuperset(names):
+            if stamp is None or not abs(stamp) < _LARGEST_STAMP:
+                damage.drop(line, f'line {line}: "{stamp_text[:20]}" is not a firmware stamp')
                 damage.check(path)
                 continue
             now = unwrapper.unwrap(int(stamp)) / 1000.0
         elif math.isnan(now):
             continue  # no firmware stamp yet, so no time
-        found.setdefault((block, tuple(packet.names)), []).append((now, order, host_time, packet.values))
+        found.setdefault((block, tuple(names)), []).append((now, order, host_time, values))
     damage.check(path)
     return found
 
@@ -114,23 +100,29 @@ def _packets(path: Path, header: Header, mapping: CsvMapping, damage: Damage) ->
             if len(fields) != len(header.names):
                 damage.drop(line, f"line {line} has {len(fields)} fields, the header has {len(header.names)}")
                 continue
-            try:
-                value = to_number(fields[v], header.decimal)
-            except ValueError:
+            value = _number_or_none(fields[v], header.decimal)
+            if value is None:
                 damage.drop(line, f'line {line}, column {header.names[v]}: "{fields[v][:20]}" is not a number')
                 continue
             damage.rows += 1
             key = (fields[h], fields[b], fields[s])
-            if packet is not None and packet.key == key and fields[n] not in packet.names:
-                packet.names.append(fields[n])
-                packet.values.append(value)
+            if packet is not None and packet[1] == key and fields[n] not in packet[2]:
+                packet[2].append(fields[n])
+                packet[3].append(value)
                 continue
             if packet is not None:
                 yield packet
-            packet = _Packet(line, key, [fields[n]], [value])
+            packet = (line, key, [fields[n]], [value])
         damage.check(path)
     if packet is not None:
         yield packet
+
+
+def _number_or_none(text: str, decimal: str = ".") -> float | None:
+    try:
+        return to_number(text, decimal)
+    except ValueError:
+        return None
 
 
 def _table(block: str, names: tuple[str, ...], packets: list[tuple[float, int, float, list[float]]]) -> Table:

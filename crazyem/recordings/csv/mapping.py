@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -20,56 +20,58 @@ BODY_AXES, WORLD_AXES = ("FLU", "FRD"), ("ENU", "NED")
 _MOTOR_SIGNALS = ("motor_command", "motor_request", "rotor_speed")
 _ANGLE_SIGNALS = ("euler", "setpoint_euler")
 
-_TOP_KEYS = {
-    "name", "title", "layout", "recognise", "time", "claims", "units", "packets", "signals", "host_signals", "columns",
-}  # fmt: skip
-_TIME_KEYS = {"column", "unit", "clock", "rate_hz"}
-_CLAIMABLE = {"unit", "frame", "sign", "scale", "offset", "order", "direction"}
-_ENTRY_KEYS = _CLAIMABLE | {
-    "columns", "variables", "packet", "stream", "clock", "missing", "above", "hold", "rotors", "pole_pairs", "attitude",
-    "corners", "published",
-}  # fmt: skip
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+# kind of a value: whether a value is of it, and the words after the name of its key in an error
+_Kind = tuple[Callable[[Any], bool], str]
+_TEXT: _Kind = (lambda v: isinstance(v, str), " must be a text")
+_FLAG: _Kind = (lambda v: isinstance(v, bool), " must be a true or false")
+_LIST: _Kind = (lambda v: isinstance(v, list), " must be a list")
+_TABLE: _Kind = (lambda v: isinstance(v, dict), " must be a table")
+_NUMBER: _Kind = (_is_number, ": must be a finite number")
+_TEXTS: _Kind = (lambda v: isinstance(v, list) and all(isinstance(n, str) for n in v), " must be a list of texts")
+_PLAIN: _Kind = (lambda v: isinstance(v, (str, int, float)), " must be a number, a text, true or false")
+_ANY: _Kind = (lambda v: True, "")
+
+_MAPPING = {
+    **dict.fromkeys(("name", "title", "layout"), _TEXT),
+    **dict.fromkeys(("time", "claims", "units", "packets", "signals", "host_signals", "columns"), _TABLE),
+    "recognise": _TEXTS,
+}
+_TIME = {"column": _TEXT, "unit": _TEXT, "clock": _TEXT, "rate_hz": _NUMBER}
+_PUBLISHED = {**dict.fromkeys(("unit", "scale", "offset"), _ANY), "sign": _LIST}
+_PUBLISHED |= dict.fromkeys(("frame", "order", "direction"), _TEXT)
+_ENTRY = _PUBLISHED | {"published": _TABLE, "missing": _ANY, "rotors": _LIST, "corners": _FLAG}
+_ENTRY |= dict.fromkeys(("columns", "variables"), _TEXTS) | dict.fromkeys(("above", "hold", "pole_pairs"), _NUMBER)
+_ENTRY |= dict.fromkeys(("packet", "stream", "clock", "attitude"), _TEXT)
 
 
 @dataclass(frozen=True, slots=True)
 class SignalColumns:
-    """Columns of one signal.
+    """Columns of one signal."""
 
-    Attributes:
-        quantity: key of `SIGNALS`; the name of the signal up to its "@".
-        columns: in the order of the components of the signal. Three for an attitude as roll, pitch, yaw.
-        scale: factor to SI with sign, one per column.
-        offset: SI, added after the factor, one per column; () for none.
-        packet: name of the onboard packet of the columns, if the publisher interpolated lost packets; else None.
-        stream: signals with the same stream were sampled together.
-        clock: name of the clock of the stamps; None: the clock of the rows.
-        frame: frame of a vector in the file, if not that of the signal: "body" or "world"; else "".
-        axes: of the frames in the file, such as ("FRD", "NED"); signals have FLU and ENU.
-        inverted: the rotation in the file is from world to body.
-        attitude: the attitude signal that rotates a vector from the other frame.
-        missing: values that mean "not measured".
-        empty_is_missing: empty fields also mean "not measured", according to the publisher.
-        above: the signal is 1 if any column exceeds this threshold, else 0 (for `flying`); None for plain columns.
-        hold: s for which the signal stays 1 afterwards.
-        corners: a slower stream was linearly interpolated at the rows; its samples are the corners.
-    """
-
-    quantity: str
-    columns: tuple[str, ...]
-    scale: tuple[float, ...]
-    offset: tuple[float, ...] = ()
+    quantity: str  # key of `SIGNALS`; the name of the signal up to its "@"
+    columns: tuple[str, ...]  # in the order of the components of the signal. Three for an attitude as roll, pitch, yaw.
+    scale: tuple[float, ...]  # factor to SI with sign, one per column
+    offset: tuple[float, ...] = ()  # SI, added after the factor, one per column; () for none
+    # name of the onboard packet of the columns, if the publisher interpolated lost packets; else None
     packet: str | None = None
-    stream: str = ""
-    clock: str | None = None
-    frame: str = ""
+    stream: str = ""  # signals with the same stream were sampled together
+    clock: str | None = None  # name of the clock of the stamps; None: the clock of the rows
+    frame: str = ""  # frame of a vector in the file, if not that of the signal: "body" or "world"; else ""
+    # of the frames in the file, such as ("FRD", "NED"); signals have FLU and ENU
     axes: tuple[str, str] = ("FLU", "ENU")
-    inverted: bool = False
-    attitude: str = "attitude"
-    missing: tuple[float, ...] = ()
-    empty_is_missing: bool = False
+    inverted: bool = False  # the rotation in the file is from world to body
+    attitude: str = "attitude"  # the attitude signal that rotates a vector from the other frame
+    missing: tuple[float, ...] = ()  # values that mean "not measured"
+    empty_is_missing: bool = False  # empty fields also mean "not measured", according to the publisher
+    # the signal is 1 if any column exceeds this threshold, else 0 (for `flying`); None for plain columns
     above: float | None = None
-    hold: float = 0.0
-    corners: bool = False
+    hold: float = 0.0  # s for which the signal stays 1 afterwards
+    corners: bool = False  # a slower stream was linearly interpolated at the rows; its samples are the corners
 
     def converted(self, value: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, c) SI from numbers of the file; changes `value` in place."""
@@ -81,81 +83,62 @@ class SignalColumns:
 
 @dataclass(frozen=True, slots=True)
 class CsvMapping:
-    """A CSV format: its header and its contents (docs/reference/formats/csv.md).
+    """A CSV format: its header and its contents (docs/reference/formats/csv.md)."""
 
-    Attributes:
-        name, title: for people.
-        layout: "wide" (one row per instant) or "long" (one row per variable).
-        recognise: columns that identify the format.
-        time: name of the time column ("" with `rate`), and the divisor from its stamps to seconds.
-        rate: Hz, rate of rows without stamps, else NaN.
-        clock: name of the clock of the rows; "host" means seconds since the epoch.
-        signals: signal name -> its columns, with known errors corrected.
-        published: the same as the publisher states; differs from `signals` where the publisher is wrong.
-        columns: of the long form: role -> column name.
-        units: of columns that are no signal.
-        packets: packet -> its columns that are no signal.
-        claims: statements of the publisher about the whole recording, e.g. mass_kg.
-    """
-
-    name: str
+    name: str  # name, title: for people
     title: str
-    layout: str
-    recognise: tuple[str, ...]
-    time: tuple[str, float]
-    signals: Mapping[str, SignalColumns]
-    columns: Mapping[str, str]
+    layout: str  # "wide" (one row per instant) or "long" (one row per variable)
+    recognise: tuple[str, ...]  # columns that identify the format
+    time: tuple[str, float]  # name of the time column ("" with `rate`), and the divisor from its stamps to seconds
+    signals: Mapping[str, SignalColumns]  # signal name -> its columns, with known errors corrected
+    columns: Mapping[str, str]  # of the long form: role -> column name
+    # the same as the publisher states; differs from `signals` where the publisher is wrong
     published: Mapping[str, SignalColumns] = field(default_factory=dict)
-    rate: float = math.nan
-    clock: str = ""
-    units: Mapping[str, str] = field(default_factory=dict)
-    packets: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    rate: float = math.nan  # Hz, rate of rows without stamps, else NaN
+    clock: str = ""  # name of the clock of the rows; "host" means seconds since the epoch
+    units: Mapping[str, str] = field(default_factory=dict)  # of columns that are no signal
+    packets: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # packet -> its columns that are no signal
+    # statements of the publisher about the whole recording, e.g. mass_kg.
     claims: Mapping[str, str] = field(default_factory=dict)
 
 
 def load_mapping(text: str, where: str) -> CsvMapping:
     """A mapping from its TOML text; `where` names it in error messages. Raises FileFormatError naming the key."""
     table = parse_toml(text, where=where)
-    _known(table, _TOP_KEYS, where)
-    layout = _get(table, "layout", str, where, "wide")
+    _check(table, _MAPPING, where)
+    layout = table.get("layout", "wide")
     if layout not in ("wide", "long"):
         raise FileFormatError(f'{where}: layout must be "wide" or "long", not "{layout}".')
     key, columns_key = ("signals", "columns") if layout == "wide" else ("host_signals", "variables")
-    entries = _get(table, key, dict, where, {})
-    for name, entry in entries.items():
-        if not isinstance(entry, dict):
-            raise FileFormatError(f"{where}: {key}.{name} must be a table.")
+    entries = table.get(key, {})
+    _check(entries, dict.fromkeys(entries, _TABLE), f"{where}: {key}.")
     signals = {n: _signal(n, e, f"{where}: {key}.{n}", columns_key) for n, e in entries.items()}
     published = {n: _signal(n, _claimed(e), f"{where}: {key}.{n}", columns_key) for n, e in entries.items()}
-    time = _get(table, "time", dict, where, {})
-    _known(time, _TIME_KEYS, f"{where}: time")
-    columns = _entries(table, "columns", where)
-    rate = _number(time, "rate_hz", f"{where}: time", math.nan)
+    time, columns, claims = (table.get(section, {}) for section in ("time", "columns", "claims"))
+    _check(time, _TIME, f"{where}: time")
+    for section, kind in (("columns", _TEXT), ("units", _TEXT), ("packets", _TEXTS), ("claims", _PLAIN)):
+        _check(table.get(section, {}), dict.fromkeys(table.get(section, {}), kind), f"{where}: {section}.")
+    rate = float(time.get("rate_hz", math.nan))
     if layout == "long":
-        for needed in ("host_time", "block", "stamp_ms", "name", "value"):
-            _get(columns, needed, str, f"{where}: columns")
+        _require(columns, f"{where}: columns", "host_time", "block", "stamp_ms", "name", "value")
     elif "rate_hz" not in time:
-        _get(time, "column", str, f"{where}: time")
+        _require(time, f"{where}: time", "column")
     elif not (0.0 < rate < math.inf) or "column" in time:
         raise FileFormatError(f"{where}: time needs a column, or a positive rate_hz for rows without stamps.")
-    name = _get(table, "name", str, where, Path(where).stem)
-    claims = _entries(table, "claims", where, (str, int, float, bool), "a number, a text, true or false")
+    name = table.get("name", Path(where).stem)
     return CsvMapping(
         name=name,
-        title=_get(table, "title", str, where, name),
+        title=table.get("title", name),
         layout=layout,
-        recognise=_names(table, "recognise", where, ()),
-        time=(
-            _get(time, "column", str, f"{where}: time", ""),
-            time_divisor(_get(time, "unit", str, f"{where}: time", "s"), f"{where}: time.unit"),
-        ),
+        recognise=tuple(table.get("recognise", ())),
+        time=(time.get("column", ""), time_divisor(time.get("unit", "s"), f"{where}: time.unit")),
         signals=signals,
-        columns=columns,
+        columns=dict(columns),
         published=published,
         rate=rate,
-        clock=_get(time, "clock", str, f"{where}: time", ""),
-        units=_entries(table, "units", where),
-        packets={p: _names(table["packets"], p, f"{where}: packets") for p in _get(table, "packets", dict, where, {})},
+        clock=time.get("clock", ""),
+        units=dict(table.get("units", {})),
+        packets={packet: tuple(names) for packet, names in table.get("packets", {}).items()},
         claims={k: str(v).lower() if isinstance(v, bool) else str(v) for k, v in claims.items()},
     )
 
@@ -210,15 +193,15 @@ def _signal(name: str, entry: Mapping[str, Any], where: str, key: str) -> Signal
     quantity, at, origin = name.partition("@")
     if quantity not in SIGNALS or (at and not origin):
         raise FileFormatError(f"{where}: no such signal; known are {', '.join(SIGNALS)}.")
-    _known(entry, _ENTRY_KEYS, where)
-    _known(_get(entry, "published", dict, where, {}), _CLAIMABLE, f"{where}.published")
-    columns = _names(entry, key, where)
-    above = _number(entry, "above", where, None)
+    _check(entry, _ENTRY, where)
+    _check(entry.get("published", {}), _PUBLISHED, f"{where}.published")
+    _require(entry, where, key)
+    columns, above = tuple(entry[key]), entry.get("above")
     if above is None:
         columns, order = _ordered(quantity, columns, entry, where, key)
     else:
         order = tuple(range(len(columns)))
-    signs = _get(entry, "sign", list, where, [1] * len(columns))
+    signs = entry.get("sign", [1] * len(columns))
     if len(signs) != len(columns) or any(s not in (1, -1) for s in signs):
         raise FileFormatError(f"{where}.sign: needs 1 or -1 for each of the {len(columns)} columns.")
     frame, axes = _frame(quantity, entry, where)
@@ -226,12 +209,12 @@ def _signal(name: str, entry: Mapping[str, Any], where: str, key: str) -> Signal
     missing = missing if isinstance(missing, list) else [missing]
     if any(m != "" and (isinstance(m, bool) or not isinstance(m, (int, float))) for m in missing):
         raise FileFormatError(f'{where}.missing: must be numbers, or "" for fields without a number.')
-    direction = _get(entry, "direction", str, where, "body to world")
+    direction = entry.get("direction", "body to world")
     if direction not in ("body to world", "world to body"):
         raise FileFormatError(f'{where}.direction: must be "body to world" or "world to body", not "{direction}".')
-    packet = _get(entry, "packet", str, where, None)
+    packet = entry.get("packet")
     factors, offsets = _factors(quantity, len(columns), entry, above, where)
-    corners = bool(_get(entry, "corners", bool, where, False))
+    corners = entry.get("corners", False)
     if corners and len(columns) != 1:
         raise FileFormatError(f"{where}.corners: only for signals of one column.")
     return SignalColumns(
@@ -241,16 +224,16 @@ def _signal(name: str, entry: Mapping[str, Any], where: str, key: str) -> Signal
         scale=tuple(float(factors[i] * signs[i]) for i in order),
         offset=tuple(offsets[0][i] * signs[i] + offsets[1][i] for i in order) if any(map(any, offsets)) else (),
         packet=packet,
-        stream=_get(entry, "stream", str, where, packet or "rows"),
-        clock=_get(entry, "clock", str, where, None),
+        stream=entry.get("stream", packet or "rows"),
+        clock=entry.get("clock"),
         frame=frame,
         axes=axes,
         inverted=direction == "world to body",
-        attitude=_get(entry, "attitude", str, where, "attitude"),
+        attitude=entry.get("attitude", "attitude"),
         missing=tuple(float(m) for m in missing if m != ""),
         empty_is_missing="" in missing,
-        above=above,
-        hold=_number(entry, "hold", where, 0.0) or 0.0,
+        above=None if above is None else float(above),
+        hold=float(entry.get("hold", 0.0)),
         corners=corners,
     )
 
@@ -276,9 +259,9 @@ def _ordered(
     if "rotors" in entry:
         if quantity not in _MOTOR_SIGNALS:
             raise FileFormatError(f"{where}.rotors: only for motor_command, motor_request and rotor_speed.")
-        given = tuple(f"m{r}" for r in _get(entry, "rotors", list, where))
+        given = tuple(f"m{r}" for r in entry["rotors"])
     elif "order" in entry:
-        text = _get(entry, "order", str, where)
+        text = entry["order"]
         given = tuple(text) if len(text) == count == 4 else tuple(text.replace(",", " ").split())
     if sorted(given) != sorted(labels):
         what = "rotors" if "rotors" in entry else "order"
@@ -291,12 +274,8 @@ def _factors(
     quantity: str, count: int, entry: Mapping[str, Any], above: float | None, where: str
 ) -> tuple[tuple[float, ...], tuple[tuple[float, ...], tuple[float, ...]]]:
     """Factors to SI in the order of the columns in the file, and two offsets: of the unit, and of the mapping."""
-    units = entry.get("unit", "")
-    units = units if isinstance(units, list) else [units] * count
-    scales = entry.get("scale", 1.0)
-    scales = scales if isinstance(scales, list) else [scales] * count
-    offsets = entry.get("offset", 0.0)
-    offsets = offsets if isinstance(offsets, list) else [offsets] * count
+    given = (entry.get(key, default) for key, default in (("unit", ""), ("scale", 1.0), ("offset", 0.0)))
+    units, scales, offsets = (value if isinstance(value, list) else [value] * count for value in given)
     if len(units) != count or not all(isinstance(u, str) for u in units):
         raise FileFormatError(f"{where}.unit: must be a text, or one for each of the {count} columns.")
     if len(scales) != count or not all(_is_number(s) and s != 0 for s in scales):
@@ -306,7 +285,7 @@ def _factors(
     added = tuple(float(o) for o in offsets)
     if above is not None:
         return tuple(float(s) for s in scales), ((0.0,) * count, added)
-    pairs = _number(entry, "pole_pairs", where, None)
+    pairs = entry.get("pole_pairs")
     if any(map(is_electrical, units)) and not (pairs and pairs > 0):
         raise FileFormatError(f"{where}.pole_pairs: erpm needs the number of pole pairs of the motor.")
     if pairs and not all(map(is_electrical, units)):
@@ -330,7 +309,7 @@ def _component_order(quantity: str, entry: Mapping[str, Any], count: int) -> lis
 
 def _frame(quantity: str, entry: Mapping[str, Any], where: str) -> tuple[str, tuple[str, str]]:
     """("body", "world", or "" for the frame of the signal; axes of body and world)."""
-    words = _get(entry, "frame", str, where, "").replace("to", " ").replace(",", " ").split()
+    words = entry.get("frame", "").replace("to", " ").replace(",", " ").split()
     known = ("body", "world", *BODY_AXES, *WORLD_AXES)
     unknown = next((word for word in words if word not in known), None)
     if unknown is not None:
@@ -355,48 +334,18 @@ def _frame(quantity: str, entry: Mapping[str, Any], where: str) -> tuple[str, tu
     return frames.pop(), (body, world)
 
 
-def _known(table: Mapping[str, Any], known: set[str], where: str) -> None:
-    for key in table:
-        if key not in known:
-            raise FileFormatError(f"{where}: unknown key {key!r:.60}; known are {', '.join(sorted(known))}.")
+def _check(table: Mapping[str, Any], kinds: Mapping[str, _Kind], where: str) -> None:
+    """Raise FileFormatError if a table has an unknown key or a value of another kind."""
+    for key, value in table.items():
+        if key not in kinds:
+            raise FileFormatError(f"{where}: unknown key {key!r:.60}; known are {', '.join(sorted(kinds))}.")
+        fits, words = kinds[key]
+        if not fits(value):
+            between = "" if where.endswith(".") else "." if words.startswith(":") else ": "
+            raise FileFormatError(f"{where}{between}{key}{words}.")
 
 
-_REQUIRED = object()
-
-
-def _get(table: Mapping[str, Any], key: str, kind: type, where: str, default: Any = _REQUIRED) -> Any:
-    if key not in table:
-        if default is _REQUIRED:
+def _require(table: Mapping[str, Any], where: str, *keys: str) -> None:
+    for key in keys:
+        if key not in table:
             raise FileFormatError(f"{where}: the key {key} is missing.")
-        return default
-    if not isinstance(table[key], kind):
-        names = {dict: "table", str: "text", bool: "true or false"}
-        raise FileFormatError(f"{where}: {key} must be a {names.get(kind, kind.__name__)}.")
-    return table[key]
-
-
-def _names(table: Mapping[str, Any], key: str, where: str, default: Any = _REQUIRED) -> tuple[str, ...]:
-    names = tuple(_get(table, key, list, where, default))
-    if not all(isinstance(n, str) for n in names):
-        raise FileFormatError(f"{where}: {key} must be a list of texts.")
-    return names
-
-
-def _entries(table: Mapping[str, Any], key: str, where: str, kinds: Any = str, what: str = "a text") -> dict[str, Any]:
-    """The table below a key; all its values must be of certain types, which `what` names in the error."""
-    entries = _get(table, key, dict, where, {})
-    for name, value in entries.items():
-        if not isinstance(value, kinds):
-            raise FileFormatError(f"{where}: {key}.{name} must be {what}.")
-    return dict(entries)
-
-
-def _number(table: Mapping[str, Any], key: str, where: str, default: float | None) -> Any:
-    value = table.get(key, default)
-    if value is not default and not _is_number(value):
-        raise FileFormatError(f"{where}.{key}: must be a finite number.")
-    return value if value is None else float(value)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

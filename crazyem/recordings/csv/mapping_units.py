@@ -46,6 +46,7 @@ _UNIT_OFFSETS: dict[tuple[str, str], float] = {("ratio", "us"): -1.0}
 
 _TIME_UNITS: dict[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1.0 / 60.0, "h": 1.0 / 3600.0}
 
+_KIND_OF_QUANTITY = {"voltage": "voltage", "mixer_command": "count", "motor_command": "ratio", "motor_request": "ratio"}
 _KIND_OF_UNIT = {"m": "length", "m/s": "speed", "m/s^2": "acceleration", "rad": "angle", "rad/s": "angular rate"}
 
 # other spellings of units
@@ -84,13 +85,7 @@ def kind_of(quantity: str, component: int) -> str:
     """The kind of quantity of a component of a vocabulary signal: "length", "speed", "ratio", ..."""
     if quantity == "wrench_command":
         return "force" if component == 0 else "torque"
-    if quantity == "voltage":
-        return "voltage"
-    if quantity in ("motor_command", "motor_request"):
-        return "ratio"
-    if quantity == "mixer_command":
-        return "count"
-    return _KIND_OF_UNIT.get(SIGNALS[quantity][1], "number")
+    return _KIND_OF_QUANTITY.get(quantity) or _KIND_OF_UNIT.get(SIGNALS[quantity][1], "number")
 
 
 def unit_factor(unit: str, quantity: str, component: int, where: str) -> float:

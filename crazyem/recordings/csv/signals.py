@@ -9,15 +9,125 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.physics.rotations import quaternion_from_euler, quaternion_product, rotate
-from crazyem.recordings.csv.interpolation import corners, interpolated_rows
 from crazyem.recordings.csv.mapping import SignalColumns
-from crazyem.recordings.finding import Finding, Grade, intervals_of
+from crazyem.recordings.finding import Finding, Grade, intervals_of, runs_of
+from crazyem.recordings.ordering import Array
 from crazyem.recordings.recording import SignalArray
 from crazyem.signals.sample import SIGNALS
 
-Array = NDArray[np.float64]
+RELATIVE_TOLERANCE = 1e-4  # of the change over two steps; interpolated rows are below 1e-5, noise is far above 1e-2
+ABSOLUTE_TOLERANCE = 4e-9  # files have nine decimals, rounded
+_CHUNK_ROWS = 1 << 16  # rows processed together, to bound memory
+
+
+def interpolated_rows(time: Array, values: Array) -> NDArray[np.bool_]:
+    """Rows in runs of three or more samples on one straight line in every component.
+
+    A packet carries all components, so a lost packet affects all of them at once. Constant components are no evidence
+    (saturation, motors off): at least one component must change along the line.
+
+    Args:
+        time: (n,) s, may be unevenly spaced.
+        values: (n, c), any unit.
+
+    Returns: (n,) True for every row of such a run, with its ends.
+    """
+    n = time.size
+    rows = np.zeros(n, bool)
+    for start in range(0, max(n - 2, 0), _CHUNK_ROWS):
+        part = slice(start, min(start + _CHUNK_ROWS + 2, n))
+        centres = _centres(time[part], values[part])
+        for shift in (0, 1, 2):
+            rows[start + shift : start + shift + centres.size] |= centres
+    return rows
+
+
+def _centres(time: Array, values: Array) -> NDArray[np.bool_]:
+    """(n - 2,) whether each inner row lies on the line through its neighbours, and the values change."""
+    span = time[2:] - time[:-2]
+    share = np.where(span > 0, (time[1:-1] - time[:-2]) / np.where(span > 0, span, 1.0), np.nan)
+    with np.errstate(invalid="ignore", over="ignore"):
+        change = values[2:] - values[:-2]
+        deviation = np.abs(values[1:-1] - values[:-2] - share[:, None] * change)
+        on_line = (deviation <= ABSOLUTE_TOLERANCE + RELATIVE_TOLERANCE * np.abs(change)).all(axis=1)
+        # a change near the rounding error of the file looks straight in any case
+        moving = (np.abs(change) > 1e3 * ABSOLUTE_TOLERANCE).any(axis=1)
+    return np.asarray(on_line & moving)
+
+
+CONTEXT_ROWS = 32  # rows on either side of a row that the rules below use at most
+_LONGEST_GROUP = 8  # consecutive rows off every line that may be corners; longer groups are measured rows
+_SHARE_OUTSIDE = 0.02  # of the interval between two rows; a corner may lie so far outside, for rounding
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corners:
+    """The samples of a slow stream that was linearly interpolated at faster rows."""
+
+    row: NDArray[np.int64]  # (m,) the last row at or before each sample, increasing
+    time: Array  # (m,) s
+    value: Array  # (m,)
+
+
+def corners(time: Array, value: Array, *, starts: bool = True, ends: bool = True) -> Corners:
+    """Recover the samples of a linear interpolation: its corners, between two rows or on a row.
+
+    The corner between rows k and k+1 is the intersection of the line through k-1 and k with the line through k+1 and
+    k+2. A sample in the middle of a straight part looks like the line and is not recovered. If more than eight
+    consecutive rows lie on no line, these rows are the samples.
+
+    Args:
+        time: (n,) s, may be unevenly spaced.
+        value: (n,)
+        starts, ends: whether row 0 and row n-1 are the first and the last row of the file.
+    """
+    n = time.size
+    if n < 4:
+        return Corners(np.arange(n), time.copy(), value.copy())
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        share = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
+        deviation = np.abs(value[1:-1] - value[:-2] - share * (value[2:] - value[:-2]))
+    off = np.zeros(n, bool)
+    off[1:-1] = ~(deviation <= ABSOLUTE_TOLERANCE)  # NaN is off every line
+    begin, end = runs_of(off).T
+    length = end - begin
+    pairs = [
+        (begin[length == size, None] + np.arange(0, size, 2)[None, :]).ravel()
+        for size in range(2, _LONGEST_GROUP + 1, 2)
+    ]
+    before = np.sort(np.concatenate(pairs)).astype(np.int64)
+    met, where = _meeting(time, value, before)
+    measured = np.zeros(n, bool)
+    # a corner on a row; not beside the first or last row, where the corner may also lie between the two rows
+    measured[begin[(length == 1) & (begin > 1) & (begin < n - 2)]] = True
+    measured[before[~met]] = measured[before[~met] + 1] = True
+    for first, count in zip(begin[length > _LONGEST_GROUP], length[length > _LONGEST_GROUP], strict=True):
+        last = first + count
+        measured[first - (starts and first == 1) : last + (ends and last == n - 1)] = True
+    if starts and value[0] == value[1] == value[2]:
+        measured[0] = True  # constant from the first row on: not interpolated
+    measured |= ~np.isfinite(value)  # NaN is not interpolated and is kept
+    rows = np.flatnonzero(measured)
+    row = np.concatenate([rows, before[met]])
+    stamp = np.concatenate([time[rows], where[met, 0]])
+    level = np.concatenate([value[rows], where[met, 1]])
+    place = np.argsort(row, kind="stable")
+    return Corners(row[place], stamp[place], level[place])
+
+
+def _meeting(time: Array, value: Array, k: NDArray[np.int64]) -> tuple[NDArray[np.bool_], Array]:
+    """Whether the lines before row k and after row k+1 meet between these rows, and (time, value) of the point."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        left = (value[k] - value[k - 1]) / (time[k] - time[k - 1])
+        right = (value[k + 2] - value[k + 1]) / (time[k + 2] - time[k + 1])
+        step = time[k + 1] - time[k]
+        share = (value[k + 1] - value[k] - right * step) / (left - right) / step
+        met = (share > -_SHARE_OUTSIDE) & (share < 1.0 + _SHARE_OUTSIDE) & (step > 0)
+        share = np.clip(np.where(met, share, 0.0), 0.0, 1.0)
+        return met, np.stack([time[k] + share * step, value[k] + left * share * step], axis=1)
+
+
 _HARMLESS_SHARE = 0.05  # of rows drawn across lost packets
-_CHUNK_ROWS = 1 << 16  # rows turned together, to bound memory
 _SQRT_HALF = math.sqrt(0.5)
 _NED_TO_ENU = (_SQRT_HALF, _SQRT_HALF, 0.0, 0.0)  # x y z w: half a turn about the bisector of north and east
 _FLU_TO_FRD = (1.0, 0.0, 0.0, 0.0)  # half a turn about x
@@ -25,42 +135,27 @@ _FLU_TO_FRD = (1.0, 0.0, 0.0, 0.0)  # half a turn about x
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How the columns of a file become signals.
+    """How the columns of a file become signals."""
 
-    Attributes:
-        signals: name -> columns; the vocabulary first, in its order.
-        raw: columns without a mapping: column -> (name of the signal, unit, packet or None).
-        packets: packet -> all its columns.
-        clock: name of the clock of the rows; "host" means that stamps are host times.
-    """
-
-    signals: Mapping[str, SignalColumns]
+    signals: Mapping[str, SignalColumns]  # name -> columns; the vocabulary first, in its order
+    # columns without a mapping: column -> (name of the signal, unit, packet or None)
     raw: Mapping[str, tuple[str, str, str | None]]
-    packets: Mapping[str, tuple[str, ...]]
-    clock: str
+    packets: Mapping[str, tuple[str, ...]]  # packet -> all its columns
+    clock: str  # name of the clock of the rows; "host" means that stamps are host times
 
 
 @dataclass(slots=True)
 class Rows:
-    """Some rows of a file, with neighbours before and after that are needed to find interpolated rows.
+    """Some rows of a file, with neighbours before and after that are needed to find interpolated rows."""
 
-    Attributes:
-        stamp: (n,) s on the clock of the rows.
-        origin: s; signals have the time `stamp - origin`.
-        columns: name -> (n,)
-        keep: rows first..last-1 of these become signals, the others are neighbours.
-        number: of row `keep[0]` in the file, from 0.
-        starts, ends: whether these rows hold the first and the last row of the file.
-        flown: signal -> stamp of the last earlier row in which its columns exceeded its threshold.
-    """
-
-    stamp: Array
-    origin: float
-    columns: dict[str, Array]
-    keep: tuple[int, int]
-    number: int = 0
-    starts: bool = True
+    stamp: Array  # (n,) s on the clock of the rows
+    origin: float  # s; signals have the time `stamp - origin`
+    columns: dict[str, Array]  # name -> (n,)
+    keep: tuple[int, int]  # rows first..last-1 of these become signals, the others are neighbours
+    number: int = 0  # of row `keep[0]` in the file, from 0
+    starts: bool = True  # starts, ends: whether these rows hold the first and the last row of the file
     ends: bool = True
+    # signal -> stamp of the last earlier row in which its columns exceeded its threshold
     flown: dict[str, float] = field(default_factory=dict)
 
 
@@ -152,17 +247,8 @@ class _Kept:
         if packet is not None and self.straight[packet].any():
             marked = self.straight[packet]
             value[marked] = np.nan
-        return SignalArray(
-            self.time,
-            value,
-            self._raw_order,
-            self.host,
-            marked,
-            unit=unit,
-            clock=self.layout.clock,
-            stream=packet or "rows",
-            source=(column,),
-        )
+        about = ("", unit, "", self.layout.clock, packet or "rows", (column,))
+        return SignalArray(self.time, value, self._raw_order, self.host, marked, *about)
 
     def slow(self, source: SignalColumns, place: int, step: int) -> SignalArray:
         """The original samples of a slow stream that was linearly interpolated at the rows."""

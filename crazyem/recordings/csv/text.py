@@ -5,23 +5,22 @@ parses the block again line by line. So each error has a line and a column, and 
 """
 
 import csv
-import gzip
 import io
 import math
-import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.csv
 from numpy.typing import NDArray
 
-from crazyem.errors import FileFormatError, UsageError
+from crazyem.errors import FileFormatError
 from crazyem.recordings.columns import unique_name
+from crazyem.recordings.contents import opened
+from crazyem.recordings.finding import Finding, Grade, note
 
 BLOCK_BYTES = 4 << 20
 LONGEST_LINE = 1 << 20  # bytes
@@ -61,27 +60,36 @@ class Damage:
         if 100 * self.dropped > self.rows + self.dropped:
             raise FileFormatError(f"{path}: {self.first}.")
 
+    def findings(self, names: Sequence[str] = ()) -> list[Finding]:
+        """Findings about damaged lines and fields of a file whose columns have these names."""
+        notes = []
+        if self.dropped:
+            where = ", ".join(map(str, self.lines)) + (", ..." if self.dropped > len(self.lines) else "")
+            text = f"{self.dropped} damaged lines were dropped (line {where}): {self.first}."
+            notes.append(note("integrity", text, Grade.DEGRADES, lines=float(self.dropped)))
+        if self.cut_gzip:
+            text = "The gzip file ends early; what was packed before its end was read."
+            notes.append(note("integrity", text, Grade.DEGRADES))
+        if self.cut_line and not self.cut_gzip:
+            notes.append(note("integrity", "The last line is cut short and was dropped."))
+        for column, count in self.words.items():
+            notes.append(
+                note("integrity", f"{count} values in column {names[column]} are no numbers.", count=float(count))
+            )
+        return notes
+
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """The names in the first line, and the format of the other lines.
+    """The names in the first line, and the format of the other lines."""
 
-    Attributes:
-        names: of the columns, made unique.
-        repeated: names that occurred more than once.
-        delimiter, decimal: characters.
-        words: columns of words (neither numbers nor true/false), by the first lines.
-        flags: columns of true and false.
-        hollow: columns without a name and without a value in the first lines.
-    """
-
-    names: tuple[str, ...]
-    repeated: tuple[str, ...]
-    delimiter: str
+    names: tuple[str, ...]  # of the columns, made unique
+    repeated: tuple[str, ...]  # names that occurred more than once
+    delimiter: str  # delimiter, decimal: characters
     decimal: str
-    words: frozenset[int]
-    flags: frozenset[int]
-    hollow: frozenset[int]
+    words: frozenset[int]  # columns of words (neither numbers nor true/false), by the first lines
+    flags: frozenset[int]  # columns of true and false
+    hollow: frozenset[int]  # columns without a name and without a value in the first lines
 
 
 def parse_header_line(line: str) -> tuple[list[str], str]:
@@ -171,34 +179,25 @@ def text_blocks(path: Path, damage: Damage, size: int = BLOCK_BYTES) -> Iterator
         UsageError if the file cannot be read.
     """
     rest = b""
-    try:
-        with path.open("rb") as raw:
-            packed = raw.read(2) == b"\x1f\x8b"
-            raw.seek(0)
-            source: IO[bytes] = gzip.GzipFile(fileobj=raw) if packed else raw  # type: ignore[assignment]
-            total = 0
-            while True:
-                chunk, ended = _chunk(source, size, packed)
-                damage.cut_gzip |= ended
-                total += len(chunk)
-                if packed and total > _SMALL_TEXT and total > LARGEST_RATIO * raw.tell():
-                    raise FileFormatError(
-                        f"{path}: the gzip file unpacks to more than {LARGEST_RATIO} times its size; it is not read."
-                    )
-                if not chunk:
-                    break
-                block, newline, rest_of_it = (rest + chunk).rpartition(b"\n")
-                rest = rest_of_it
-                if len(rest) > LONGEST_LINE:
-                    raise FileFormatError(f"{path}: there is a line of more than {LONGEST_LINE} bytes.")
-                if newline:
-                    yield block + newline
-                if ended:
-                    break
-    except (gzip.BadGzipFile, zlib.error) as error:
-        raise FileFormatError(f"{path} is not a readable gzip file ({error}).") from error
-    except OSError as error:
-        raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
+    total = 0
+    with opened(path) as (raw, source, packed):
+        while True:
+            chunk, ended = _chunk(source, size, packed)
+            damage.cut_gzip |= ended
+            total += len(chunk)
+            if packed and total > _SMALL_TEXT and total > LARGEST_RATIO * raw.tell():
+                raise FileFormatError(
+                    f"{path}: the gzip file unpacks to more than {LARGEST_RATIO} times its size; it is not read."
+                )
+            if not chunk:
+                break
+            block, newline, rest = (rest + chunk).rpartition(b"\n")
+            if len(rest) > LONGEST_LINE:
+                raise FileFormatError(f"{path}: there is a line of more than {LONGEST_LINE} bytes.")
+            if newline:
+                yield block + newline
+            if ended:
+                break
     damage.cut_line = bool(rest.strip())
 
 
@@ -223,7 +222,7 @@ def _chunk(source: IO[bytes], size: int, packed: bool) -> tuple[bytes, bool]:
 def _fast(block: bytes, header: Header, columns: tuple[int, ...]) -> Columns | None:
     """The block parsed by pyarrow; None if pyarrow fails or the number of rows differs from that of lines."""
     names = [str(i) for i in range(len(header.names))]
-    types = {str(c): pa.string() if c in header.flags else pa.float64() for c in columns}
+    types = {str(c): pa.bool_() if c in header.flags else pa.float64() for c in columns}
     try:
         table = pyarrow.csv.read_csv(
             pa.BufferReader(block),
@@ -234,6 +233,8 @@ def _fast(block: bytes, header: Header, columns: tuple[int, ...]) -> Columns | N
                 column_types=types,
                 include_columns=[str(c) for c in columns],
                 null_values=_NULLS,
+                true_values=["true", "True", "TRUE"],
+                false_values=["false", "False", "FALSE"],
                 strings_can_be_null=True,
                 decimal_point=header.decimal,
             ),
@@ -242,29 +243,7 @@ def _fast(block: bytes, header: Header, columns: tuple[int, ...]) -> Columns | N
         return None
     if table.num_rows != block.count(b"\n"):
         return None
-    result = {}
-    for c in columns:
-        column = table.column(str(c))
-        if c in header.flags:
-            value = _flags(column)
-            if value is None:
-                return None
-            result[c] = value
-        else:
-            result[c] = column.to_numpy()
-    return result
-
-
-def _flags(column: pa.ChunkedArray) -> NDArray[np.float64] | None:
-    """1 and 0 for true and false, NaN for empty fields; None if there are other words."""
-    try:
-        low = pc.utf8_lower(pc.utf8_trim_whitespace(column))
-    except pa.ArrowException:
-        return None
-    true, false = pc.equal(low, "true"), pc.equal(low, "false")
-    if pc.any(pc.and_(pc.invert(true), pc.invert(false))).as_py():
-        return None
-    return pc.cast(true, pa.float64()).to_numpy()
+    return {c: table.column(str(c)).cast(pa.float64()).to_numpy() for c in columns}
 
 
 def _careful(

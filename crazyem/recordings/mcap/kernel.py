@@ -52,11 +52,3 @@ def chunk_records(data, messages, others):
             return -1, -1
         at += 9 + length
     return m, k
-
-
-@compiled
-def gather(data, offsets, rows):
-    """Copy the bytes from each offset to a row; the length of a row is their number."""
-    for i in range(offsets.size):
-        for j in range(rows.shape[1]):
-            rows[i, j] = data[offsets[i] + j]

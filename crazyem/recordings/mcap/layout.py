@@ -36,31 +36,7 @@ _SCENE: dict[str, Any] = {
 
 def foxglove_layout() -> dict[str, Any]:
     """The layout of a flight recorded by `crazyem fly` or `crazyem watch`, ready for JSON."""
-    inertia = [
-        path for name, colour in zip(("Ixx", "Iyy", "Izz"), _COLOURS, strict=False) for path in _estimate(name, colour)
-    ]
-    panels: dict[str, Any] = {
-        "3D!pose": dict(_SCENE),
-        "Plot!mass": _plot("mass [kg], 95 % interval", _estimate("mass", _COLOURS[0])),
-        "Plot!inertia": {
-            "minYValue": 0,
-            "maxYValue": 6e-05,
-            **_plot("inertia [kg m^2], 95 % intervals", inertia),
-        },
-        "Plot!lag": _plot("motor time constant [s], 95 % interval", _estimate("motor_time_constant", _COLOURS[3])),
-        "Plot!position_residual": _residual("position residual [m]", "position"),
-        "Plot!attitude_residual": _residual("attitude residual [rad]", "attitude"),
-        "Plot!rate_residual": _residual("body rate residual [rad/s]", "body_rate"),
-        "Plot!link": _plot(
-            "link: packets a second, late, lost",
-            _paths({"/link.rate": "packets a second", "/link.lost": "lost", "/link.late": "late"}),
-        ),
-        "Plot!latency": _plot("link: delay over the promptest packets [s]", _paths({"/link.latency": "delay"})),
-        "Plot!motors": _plot("motor commands", _paths({f"/log/1.motor_m{n}": f"m{n}" for n in range(1, 5)})),
-        "Plot!voltage": _plot("battery voltage", _paths({"/log/1.pm_vbatMV": "voltage"})),
-        "RawMessages!estimate": {"topicPath": "/estimate", "diffEnabled": False, "expansion": "all"},
-        "RosOut!log": {"topicToRender": "/events", "searchTerms": [], "minLogLevel": 1},
-    }
+    panels = {"3D!pose": dict(_SCENE), **_panels()}
     estimate = _columns(_columns("Plot!mass", "Plot!inertia"), "Plot!lag")
     residuals = _columns(_columns("Plot!position_residual", "Plot!attitude_residual"), "Plot!rate_residual")
     link = _columns(_columns("Plot!link", "Plot!latency"), _columns("Plot!motors", "Plot!voltage"))
@@ -73,6 +49,36 @@ def foxglove_layout() -> dict[str, Any]:
         "userNodes": {},
         "playbackConfig": {"speed": 1},
         "layout": {**_rows(left, "Tab!right"), "splitPercentage": 45},
+    }
+
+
+def _panels(topics: str = "", head: str = "") -> dict[str, Any]:
+    """All panels but the scene, by identifier; `topics` begins their topics, `head` the titles of their plots."""
+
+    def plot(title: str, paths: list[dict[str, Any]], **more: float) -> dict[str, Any]:
+        moved = [{**path, "value": topics + path["value"]} for path in paths]
+        return {**more, "foxglovePanelTitle": head + title, "title": head + title, "paths": moved, **_PLOT}
+
+    def residual(title: str, name: str) -> dict[str, Any]:
+        """The plot of a residual and its expected standard deviation."""
+        lines = _paths({f"/residual.{name}_{axis}": axis for axis in "xyz"})
+        return plot(title, [*lines, _path(f"/residual.{name}_x_sd", "expected sd of x", _GREY)])
+
+    inertia = [path for name, colour in zip(("Ixx", "Iyy", "Izz"), _COLOURS) for path in _estimate(name, colour)]
+    link = {"/link.rate": "packets a second", "/link.lost": "lost", "/link.late": "late"}
+    return {
+        "Plot!mass": plot("mass [kg], 95 % interval", _estimate("mass", _COLOURS[0])),
+        "Plot!inertia": plot("inertia [kg m^2], 95 % intervals", inertia, minYValue=0, maxYValue=6e-05),
+        "Plot!lag": plot("motor time constant [s], 95 % interval", _estimate("motor_time_constant", _COLOURS[3])),
+        "Plot!position_residual": residual("position residual [m]", "position"),
+        "Plot!attitude_residual": residual("attitude residual [rad]", "attitude"),
+        "Plot!rate_residual": residual("body rate residual [rad/s]", "body_rate"),
+        "Plot!link": plot("link: packets a second, late, lost", _paths(link)),
+        "Plot!latency": plot("link: delay over the promptest packets [s]", _paths({"/link.latency": "delay"})),
+        "Plot!motors": plot("motor commands", _paths({f"/log/1.motor_m{n}": f"m{n}" for n in range(1, 5)})),
+        "Plot!voltage": plot("battery voltage", _paths({"/log/1.pm_vbatMV": "voltage"})),
+        "RawMessages!estimate": {"topicPath": f"{topics}/estimate", "diffEnabled": False, "expansion": "all"},
+        "RosOut!log": {"topicToRender": f"{topics}/events", "searchTerms": [], "minLogLevel": 1},
     }
 
 
@@ -101,26 +107,16 @@ def _estimate(name: str, colour: str) -> list[dict[str, Any]]:
     return [_path(f"{value}.value", name, colour), *ends]
 
 
-def _residual(title: str, name: str) -> dict[str, Any]:
-    """The plot of a residual and its expected standard deviation."""
-    lines = _paths({f"/residual.{name}_{axis}": axis for axis in "xyz"})
-    return _plot(title, [*lines, _path(f"/residual.{name}_x_sd", "expected sd of x", _GREY)])
-
-
-def _plot(title: str, paths: list[dict[str, Any]]) -> dict[str, Any]:
-    return {
-        "foxglovePanelTitle": title,
-        "title": title,
-        "paths": paths,
-        "showXAxisLabels": True,
-        "showYAxisLabels": True,
-        "showLegend": True,
-        "legendDisplay": "left",
-        "showPlotValuesInLegend": False,
-        "isSynced": True,
-        "xAxisVal": "timestamp",
-        "sidebarDimension": 170,
-    }
+_PLOT = {
+    "showXAxisLabels": True,
+    "showYAxisLabels": True,
+    "showLegend": True,
+    "legendDisplay": "left",
+    "showPlotValuesInLegend": False,
+    "isSynced": True,
+    "xAxisVal": "timestamp",
+    "sidebarDimension": 170,
+}
 
 
 def swarm_layout(names: Sequence[str]) -> dict[str, Any]:
@@ -149,7 +145,7 @@ def swarm_layout(names: Sequence[str]) -> dict[str, Any]:
     tabs = [_tab("All", _columns(_columns("Plot!mass", "Plot!lost"), "Plot!voltage"))]
     for name in names:
         own = {k: f"{k}_{name}" for k in single if k.split("!")[0] not in ("3D", "Tab")}
-        panels |= {own[k]: _of_drone(single[k], name) for k in own}
+        panels |= {own[k]: panel for k, panel in _panels(f"/{name}", f"{name}: ").items()}
         tabs.append(_tab(name, _side_by_side(own)))
     panels["Tab!drones"] = {"activeTabIdx": 0, "tabs": tabs}
     return {**layout, "configById": panels, "layout": {**_rows("3D!pose", "Tab!drones"), "splitPercentage": 30}}
@@ -162,24 +158,7 @@ def _together(panel: dict[str, Any], title: str, names: Sequence[str], *, path: 
         {**first, "value": f"/{name}{path or first['value']}", "label": name, "color": _COLOURS[i % len(_COLOURS)]}
         for i, name in enumerate(names)
     ]
-    return {**panel, **_titles(panel, title), "paths": paths}
-
-
-def _of_drone(panel: dict[str, Any], name: str) -> dict[str, Any]:
-    """A panel of the layout for one drone, with the name of the drone before its topics."""
-    moved = dict(panel)
-    for key in ("topicPath", "topicToRender"):
-        if key in panel:
-            moved[key] = f"/{name}{panel[key]}"
-    if "paths" in panel:
-        moved["paths"] = [{**p, "value": f"/{name}{p['value']}"} for p in panel["paths"]]
-    moved.update(_titles(panel, f"{name}: {panel.get('title', '')}"))
-    return moved
-
-
-def _titles(panel: dict[str, Any], title: str) -> dict[str, Any]:
-    """The new title under each title key of the panel."""
-    return {key: title for key in ("foxglovePanelTitle", "title") if key in panel}
+    return {**panel, "foxglovePanelTitle": title, "title": title, "paths": paths}
 
 
 def _side_by_side(own: dict[str, str]) -> dict[str, Any]:

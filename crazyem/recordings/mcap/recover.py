@@ -9,10 +9,8 @@ import numpy as np
 from crazyem.atomic_file import new_file
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings.mcap import scan as mcap_scan
-from crazyem.recordings.mcap.messages import PROFILE
 from crazyem.recordings.mcap.output import Output
-from crazyem.recordings.mcap.scan import HEAD, MCAP_MAGIC, Loss, Problem
-from crazyem.recordings.mcap.survey import Part, from_summary, index_of, parse, parts, profile_of
+from crazyem.recordings.mcap.schemas import PROFILE
 
 
 @dataclass
@@ -33,11 +31,11 @@ class Report:
     metadata: int = 0
     attachments: int = 0
     lost_messages: int | None = None
-    problems: list[Problem] = field(default_factory=list)
+    problems: list[mcap_scan.Problem] = field(default_factory=list)
 
     @property
     def closed(self) -> bool:
-        return not any(p.loss in (Loss.CUT, Loss.OPEN) for p in self.problems)
+        return not any(p.loss in (mcap_scan.Loss.CUT, mcap_scan.Loss.OPEN) for p in self.problems)
 
     @property
     def lost_bytes(self) -> int:
@@ -52,7 +50,7 @@ class Report:
         lines = [f"{self.messages} messages in {self.chunks} chunks recovered"]
         if self.lost_messages:
             lines.append(f"{self.lost_messages} messages lost")
-        lines += [f"byte {p.offset} to {p.end}: {p.why}" for p in self.problems if p.loss is not Loss.OPEN]
+        lines += [f"byte {p.offset} to {p.end}: {p.why}" for p in self.problems if p.loss is not mcap_scan.Loss.OPEN]
         return "\n".join(lines)
 
 
@@ -75,7 +73,7 @@ def recover(source: str | Path, target: str | Path, *, replace: bool = False) ->
     with new_file(target, force=replace) as temporary:
         with source.open("rb") as stream:
             head = stream.read(4096)
-        if not head.startswith(MCAP_MAGIC):
+        if not head.startswith(mcap_scan.MCAP_MAGIC):
             raise FileFormatError(f"{source} is not an MCAP file.")
         with temporary.open("wb") as stream:
             report = _copy(source, head, Output(stream))
@@ -86,15 +84,15 @@ def recover(source: str | Path, target: str | Path, *, replace: bool = False) ->
 
 
 def _copy(source: Path, head: bytes, output: Output) -> Report:
-    profile = profile_of(head)
+    profile = mcap_scan.profile_of(head)
     report = Report(profile=profile or "")
     output.start(report.profile, "crazyem recover")
     # the summary repeats announcements that may be lost in a damaged chunk
-    known = {(type(r).__name__, r.id): r for r in from_summary(source)[0]}
+    known = {(type(r).__name__, r.id): r for r in mcap_scan.from_summary(source)[0]}
     seen: set[tuple[str, int]] = set()
     summary = False
     newest = lost = 0  # sequence numbers are consecutive in a whole file of crazyem
-    for part in parts(source, report.problems):
+    for part in mcap_scan.parts(source, report.problems):
         summary = summary or part.record.opcode == mcap_scan.DATA_END
         for entry in part.announced:
             if not summary:
@@ -108,18 +106,25 @@ def _copy(source: Path, head: bytes, output: Output) -> Report:
                 lost += max(int(numbers[0]) - newest - 1, 0)
                 newest = int(numbers[-1])
         elif part.record.opcode == mcap_scan.METADATA:
-            record = parse(mcap_scan.METADATA, part.record.data)
+            record = mcap_scan.parse(mcap_scan.METADATA, part.record.data)
             if record is not None:
                 output.metadata(record.name, record.metadata)
                 report.metadata += 1
         elif part.record.opcode == mcap_scan.ATTACHMENT:
-            report.attachments += _attachment(source, part, output)
+            with source.open("rb") as stream:
+                stream.seek(part.record.offset + mcap_scan.HEAD.size)
+                record = mcap_scan.parse(mcap_scan.ATTACHMENT, stream.read(part.record.end - stream.tell()))
+            if record is not None:
+                output.attachment(record)
+                report.attachments += 1
     report.lost_messages = lost if report.profile == PROFILE else None
     output.finish()
     return report
 
 
-def _restore(output: Output, part: Part, known: dict[tuple[str, int], Any], seen: set[tuple[str, int]]) -> None:
+def _restore(
+    output: Output, part: mcap_scan.Part, known: dict[tuple[str, int], Any], seen: set[tuple[str, int]]
+) -> None:
     """Announce, from the summary, channels and schemas that this part needs and no earlier part has announced."""
     assert part.scan is not None
     needed = []
@@ -138,7 +143,7 @@ def _restore(output: Output, part: Part, known: dict[tuple[str, int], Any], seen
         output.announce_again()
 
 
-def _messages(output: Output, part: Part, report: Report) -> None:
+def _messages(output: Output, part: mcap_scan.Part, report: Report) -> None:
     """Copy a chunk byte for byte; records outside chunks, and a part of a chunk, are written as a chunk."""
     assert part.scan is not None
     scan, book = part.scan, output.book
@@ -147,29 +152,21 @@ def _messages(output: Output, part: Part, report: Report) -> None:
     messages = scan.messages[defined]
     if not defined.all():
         why = f"{int((~defined).sum())} messages of channels that nothing announces any more"
-        report.problems.append(Problem(Loss.DAMAGED, part.record.offset, part.record.end, why))
+        report.problems.append(mcap_scan.Problem(mcap_scan.Loss.DAMAGED, part.record.offset, part.record.end, why))
     if not len(messages):
         output.announce_again()
         return
     report.messages += len(messages)
     report.chunks += 1
-    if not defined.all():
-        packed = b"".join(scan.data[at - 31 : at + length].tobytes() for at, length, *_ in messages.tolist())
-        output.messages(packed, index_of(mcap_scan.scan(packed).messages))
-    elif part.chunk is not None:
+    if part.chunk is not None and defined.all():
         chunk = part.chunk
         output.flush_announcements()
-        output.chunk(chunk.compression, bytes(chunk.packed), size=chunk.size, crc=chunk.crc, index=index_of(messages))
-    else:
-        output.messages(scan.data.tobytes(), index_of(messages))
-
-
-def _attachment(source: Path, part: Part, output: Output) -> int:
-    with source.open("rb") as stream:
-        stream.seek(part.record.offset + HEAD.size)
-        data = stream.read(part.record.end - part.record.offset - HEAD.size)
-    record = parse(mcap_scan.ATTACHMENT, data)
-    if record is None:
-        return 0
-    output.attachment(record)
-    return 1
+        output.chunk(
+            chunk.compression, bytes(chunk.packed), size=chunk.size, crc=chunk.crc, index=mcap_scan.index_of(messages)
+        )
+        return
+    output.announce_again()
+    for at, length, channel, log_time, published, sequence in messages.tolist():
+        data = scan.data[at : at + length].tobytes()
+        output.message(channel, log_time % 2**64, data, sequence=sequence, publish_time=published % 2**64)
+    output.flush()

@@ -9,10 +9,15 @@ import functools
 import json
 import struct
 from collections.abc import Iterable, Mapping
+from importlib import metadata as package_metadata
 from typing import Any
 
+import msgspec
+import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from numpy.typing import NDArray
 
+from crazyem.recordings.finding import Finding
 from crazyem.signals.sample import Block, Packet, Variable
 
 _F = descriptor_pb2.FieldDescriptorProto
@@ -187,3 +192,103 @@ def tag(number: int) -> bytes:
         data.append(key & 0x7F | 0x80)
         key >>= 7
     return bytes(data) + bytes([key])
+
+
+PROFILE = "crazyem"
+FORMAT_VERSION = "1"
+WORLD_FRAME, BODY_FRAME = "world", "crazyflie"
+POSE_PERIOD = 0.04  # s between poses, which are for viewers only
+
+# kind of event -> topic, schema
+EVENT_TOPICS: dict[str, tuple[str, str]] = {
+    "setpoint": ("/setpoint", "crazyem.Setpoint"),
+    "parameter_write": ("/parameter_write", "crazyem.ParameterWrite"),
+    "estimate": ("/estimate", "crazyem.Estimate"),
+    "log": ("/events", "foxglove.Log"),
+    "link": ("/link", "crazyem.Link"),
+    "residual": ("/residual", "crazyem.Residual"),
+}
+OTHER_EVENT_TOPIC = ("/other_events", "crazyem.Event")
+FINDINGS_TOPIC = "/findings"
+FRAMES_TOPIC = "/mavlink"  # unchanged frames, message encoding "mavlink"; for other programs, never read back
+
+
+def pose_messages(
+    nanoseconds: int, translation: dict[str, float], rotation: dict[str, float]
+) -> list[tuple[str, str, dict[str, Any]]]:
+    """Topic, schema and fields of a pose (m, quaternion body to world) for viewers; time since 1970."""
+    stamp = timestamp(nanoseconds)
+    pose = {"position": translation, "orientation": rotation}
+    frame = {
+        "parent_frame_id": WORLD_FRAME,
+        "child_frame_id": BODY_FRAME,
+        "translation": translation,
+        "rotation": rotation,
+    }
+    return [
+        ("/pose", "foxglove.PoseInFrame", {"timestamp": stamp, "frame_id": WORLD_FRAME, "pose": pose}),
+        ("/tf", "foxglove.FrameTransform", {"timestamp": stamp, **frame}),
+    ]
+
+
+def timestamp(nanoseconds: int) -> dict[str, int]:
+    """Fields of google.protobuf.Timestamp."""
+    return {"seconds": nanoseconds // 10**9, "nanos": nanoseconds % 10**9}
+
+
+def fields_of(message: Any) -> dict[str, object]:
+    """All fields of a message by name; nested messages as dictionaries, NaN is kept (echo that never arrived)."""
+    result: dict[str, object] = {}
+    for field in message.DESCRIPTOR.fields:
+        value = getattr(message, field.name)
+        if field.message_type is None:
+            result[field.name] = value
+        elif isinstance(value, (list, tuple)) or hasattr(value, "add"):
+            result[field.name] = [fields_of(item) for item in value]
+        else:
+            result[field.name] = fields_of(value)
+    return result
+
+
+def versions() -> dict[str, str]:
+    """Versions of the format and of the packages that write a file."""
+    names = ("crazyem", "cflib", "mcap", "numpy")
+    return {"format": FORMAT_VERSION, **{name: _version(name) for name in names}}
+
+
+def _version(package: str) -> str:
+    try:
+        return package_metadata.version(package)
+    except package_metadata.PackageNotFoundError:
+        return "unknown"
+
+
+IMPORT_METADATA = "crazyem.signals"  # metadata record that crazyem adds to an imported recording
+_MOST_ROWS = 100_000_000  # rows of a fix; guards against damaged runs
+
+
+def findings_to_json(findings: Iterable[Finding]) -> str:
+    """The findings as one text; the sample numbers of fixes as runs."""
+    return json.dumps([finding.to_dict(rows=_runs) for finding in findings])
+
+
+def findings_from_json(text: str) -> tuple[Finding, ...]:
+    """Inverse of `findings_to_json`. Raises ValueError or RecursionError on anything else."""
+    return msgspec.convert(json.loads(text), tuple[Finding, ...], dec_hook=_rows_of_runs)
+
+
+def _rows_of_runs(kind: type, value: Any) -> NDArray[np.int64]:
+    """Rows of a fix: the only numpy array in a finding."""
+    runs = msgspec.convert(value, list[tuple[int, int]])
+    if any(a < 0 or b < a for a, b in runs) or sum(b - a for a, b in runs) > _MOST_ROWS:
+        raise ValueError("not rows")
+    return np.concatenate([np.empty(0, np.int64), *(np.arange(a, b) for a, b in runs)]).astype(np.int64)
+
+
+def _runs(rows: NDArray[np.int64]) -> list[list[int]]:
+    """[first, last + 1] of each run of consecutive numbers, in the given order."""
+    if not rows.size:
+        return []
+    breaks = np.flatnonzero(np.diff(rows) != 1) + 1
+    starts, ends = rows[np.r_[0, breaks]], rows[np.r_[breaks - 1, rows.size - 1]] + 1
+    return [[int(a), int(b)] for a, b in zip(starts, ends, strict=True)]

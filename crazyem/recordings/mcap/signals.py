@@ -4,9 +4,10 @@
 sources; events, findings and metadata. docs/reference/formats/mcap.md describes the channels.
 """
 
+import itertools
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -16,26 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.atomic_file import new_file
+from crazyem.recordings.columns import entry_of
 from crazyem.recordings.finding import Grade
 from crazyem.recordings.mcap import schemas
-from crazyem.recordings.mcap.findings import IMPORT_METADATA, findings_to_json
-from crazyem.recordings.mcap.messages import (
-    EVENT_TOPICS,
-    FINDINGS_TOPIC,
-    OTHER_EVENT_TOPIC,
-    POSE_PERIOD,
-    PROFILE,
-    fields_of,
-    pose_messages,
-    versions,
-)
 from crazyem.recordings.mcap.output import Output
-from crazyem.recordings.mcap.scan import MESSAGE, MESSAGE_HEAD
 from crazyem.recordings.mcap.stream_codec import MOST_FIELDS, MOST_SIGNALS, Column, StreamLayout, unique_name
 from crazyem.recordings.recording import Event, Recording, SignalArray
 from crazyem.recordings.topics import ranks
 
 _EPOCH_RANGE = (9.0e8, 4.2e9)  # s; stamps between 1998 and 2103 count as times since 1970
+_BLOCK_ROWS = 1 << 14  # messages prepared together; bounds the memory used besides the recording
 _LOG_LEVELS = {Grade.HARMLESS: 2, Grade.DEGRADES: 3, Grade.UNUSABLE: 4}  # of foxglove.Log
 
 
@@ -54,15 +45,15 @@ def write_recording(recording: Recording, path: str | Path, *, replace: bool = F
 
 
 def _write(recording: Recording, output: Output) -> None:
-    output.start(PROFILE, f"crazyem {versions()['crazyem']}")
+    output.start(schemas.PROFILE, f"crazyem {schemas.versions()['crazyem']}")
     own = {
-        **versions(),
+        **schemas.versions(),
         "origin": repr(float(recording.origin)),
         "source": recording.source,
         "path": recording.path,
-        "findings": findings_to_json(recording.findings),
+        "findings": schemas.findings_to_json(recording.findings),
     }
-    output.metadata(IMPORT_METADATA, own)
+    output.metadata(schemas.IMPORT_METADATA, own)
     for section, entries in recording.metadata.items():
         output.metadata(section, entries)
     # place of each sample among all samples of the recording, in processing order
@@ -70,7 +61,7 @@ def _write(recording: Recording, output: Output) -> None:
     streams = [_Stream(output, group) for group in _groups(recording.signals, places)]
     clock = _Clock(recording, streams)
     extras = [*_poses(output, recording, places, clock), *_events(output, recording, clock), *_notes(output, recording)]
-    _Merge(output, streams, extras, clock).write()
+    _write_merged(output, streams, extras, clock)
     output.finish()
 
 
@@ -79,28 +70,21 @@ def _write(recording: Recording, output: Output) -> None:
 
 @dataclass
 class _Group:
-    """Signals of one stream whose samples were taken and processed together, row by row.
-
-    Attributes:
-        base: (n,) places of the samples of the first signal in the processing order.
-        indices: places of the signals in the recording.
-    """
+    """Signals of one stream whose samples were taken and processed together, row by row."""
 
     stream: str
-    base: NDArray[np.int64]
-    names: list[str] = field(default_factory=list)
-    indices: list[int] = field(default_factory=list)
-    arrays: list[SignalArray] = field(default_factory=list)
+    base: NDArray[np.int64]  # (n,) places of the samples of the first signal in the processing order
+    members: list[tuple[str, int, SignalArray]] = field(default_factory=list)  # name, place in the recording, array
 
     def takes(self, array: SignalArray, rank: NDArray[np.int64]) -> bool:
         """Whether `array` fits into the same messages, after the present arrays."""
-        width = sum(a.value.shape[1] for a in (*self.arrays, array))
-        if len(self.arrays) >= MOST_SIGNALS or width > MOST_FIELDS:
+        width = array.value.shape[1] + sum(a.value.shape[1] for *_, a in self.members)
+        if len(self.members) >= MOST_SIGNALS or width > MOST_FIELDS:
             return False
-        mine = self.arrays[0]
+        mine = self.members[0][2]
         return (
             array.time.size == mine.time.size
-            and np.array_equal(rank, self.base + len(self.arrays))
+            and np.array_equal(rank, self.base + len(self.members))
             and _same_bits(array.time, mine.time)
             and _same_bits(array.host_time, mine.host_time)
         )
@@ -123,9 +107,7 @@ def _groups(signals: Mapping[str, SignalArray], places: Mapping[str, NDArray[np.
         if newest is None or not newest.takes(array, places[name]):
             newest = _Group(array.stream, places[name])
             groups.append(newest)
-        newest.names.append(name)
-        newest.indices.append(index[name])
-        newest.arrays.append(array)
+        newest.members.append((name, index[name], array))
     return groups
 
 
@@ -137,40 +119,32 @@ class _Stream:
         # rows in processing order; if the arrays have another order, each message contains its row
         self.rows = np.argsort(group.base, kind="stable")
         shuffled = not np.array_equal(self.rows, np.arange(self.rows.size))
-        self.arrays = group.arrays
+        self.arrays = [array for *_, array in group.members]
         self.keys = group.base[self.rows].astype(float)
         self.layout = StreamLayout(
             identifier=unique_name(group.stream or "table", taken),
             stream=group.stream,
             signals=tuple(
-                Column(n, i, _components(a), a.quantity, a.unit, a.frame, a.clock, a.source)
-                for n, i, a in zip(group.names, group.indices, group.arrays, strict=True)
+                Column(n, i, entry_of(n, a).components, a.quantity, a.unit, a.frame, a.clock, a.source)
+                for n, i, a in group.members
             ),
             rows=shuffled,
         )
         schema = output.schema(self.layout.schema_name, "protobuf", self.layout.schema_data())
         topic = f"/signals/{self.layout.identifier}"
         self.channel = output.channel(topic, "protobuf", schema, self.layout.metadata())
-        self.size = MESSAGE_HEAD.size + self.layout.messages.size
 
-    def encode(self, first: int, last: int) -> NDArray[np.uint8]:
-        """(n, size) message contents of samples `first` to `last`, counted in processing order."""
-        rows = self.rows[first:last]
-        marked = np.zeros(rows.size, np.uint64)
-        for bit, array in enumerate(self.arrays):
-            marked |= array.marked[rows].astype(np.uint64) << np.uint64(bit)
-        columns: list[NDArray[Any]] = [self.arrays[0].time[rows], self.arrays[0].host_time[rows], marked]
-        if self.layout.rows:
-            columns.append(rows)
-        for array in self.arrays:
-            columns.extend(array.value[rows].T)
-        return self.layout.messages.encode(columns)
-
-
-def _components(array: SignalArray) -> tuple[str, ...]:
-    width = array.value.shape[1]
-    names = array.components
-    return names if len(names) == width else ("",) if width == 1 else tuple(str(i) for i in range(width))
+    def contents(self) -> Iterator[bytes]:
+        """The content of each message, in processing order."""
+        for first in range(0, self.rows.size, _BLOCK_ROWS):
+            rows = self.rows[first : first + _BLOCK_ROWS]
+            marked = np.zeros(rows.size, np.uint64)
+            for bit, array in enumerate(self.arrays):
+                marked |= array.marked[rows].astype(np.uint64) << np.uint64(bit)
+            columns: list[NDArray[Any]] = [self.arrays[0].time[rows], self.arrays[0].host_time[rows], marked]
+            columns += [rows] if self.layout.rows else []
+            columns += [column for array in self.arrays for column in array.value[rows].T]
+            yield from map(bytes, self.layout.messages.encode(columns))
 
 
 # --- times and order in the file --------------------------------------------------------------------------------------
@@ -203,83 +177,34 @@ class _Extra:
     publish: int | None = None  # time of publication [ns], None: as `log_time` in the file
 
 
-class _Merge:
-    """All messages in one order, written in chunks."""
-
-    def __init__(self, output: Output, streams: Sequence[_Stream], extras: Sequence[_Extra], clock: _Clock) -> None:
-        self.output, self.streams = output, streams
-        self.extras = [e for e in extras if not math.isnan(e.key)]
-        keys = [s.keys for s in streams]
-        times = [clock.of(s.arrays[0].time[s.rows], s.arrays[0].host_time[s.rows]) for s in streams]
-        key, time = np.concatenate([*keys, np.empty(0)]), np.concatenate([*times, np.empty(0)])
-        running = _running(time[np.argsort(key)])
-        free = [e for e in extras if math.isnan(e.key)]
-        if free:
-            ordered = np.sort(key)
-            wanted = np.maximum.accumulate(np.array([e.log_time for e in free], np.uint64))
-            for extra, place in zip(free, np.searchsorted(running, wanted).tolist(), strict=True):
-                extra.key = float(ordered[place]) - 0.5 if place < key.size else math.inf
-        self.extras = sorted((*self.extras, *free), key=lambda e: e.key)
-        places = [np.full(k.size, i, np.int32) for i, k in enumerate(keys)]
-        count = len(self.extras)
-        which = np.concatenate([*places, np.full(count, len(streams), np.int32)])
-        sizes = np.concatenate([np.full(k.size, s.size) for k, s in zip(keys, streams, strict=True)] + [np.empty(0)])
-        sizes = np.concatenate([sizes, [MESSAGE_HEAD.size + len(e.data) for e in self.extras]]).astype(np.int64)
-        key = np.concatenate([key, np.array([e.key for e in self.extras], float)])
-        time = np.concatenate([time, np.array([e.log_time or math.nan for e in self.extras], float)])
-        order = np.argsort(key, kind="stable")
-        self.which, self.sizes = which[order], sizes[order]
-        self.log_times = _running(time[order])
-
-    def write(self) -> None:
-        """Write all chunks; sequence numbers are consecutive in the file."""
-        ends = np.cumsum(self.sizes)
-        done = np.zeros(len(self.streams) + 1, np.int64)
-        first, start = 0, 0
-        while first < ends.size:
-            last = int(np.searchsorted(ends, start + self.output.room, side="right"))
-            last = max(last, first + 1)
-            self._chunk(first, last, done)
-            first, start = last, int(ends[last - 1])
-
-    def _chunk(self, first: int, last: int, done: NDArray[np.int64]) -> None:
-        which, sizes, times = self.which[first:last], self.sizes[first:last], self.log_times[first:last]
-        offsets = np.cumsum(sizes) - sizes
-        data = np.empty(int(sizes.sum()), np.uint8)
-        index: dict[int, NDArray[np.uint64]] = {}
-        for i, stream in enumerate(self.streams):
-            mine = np.flatnonzero(which == i)
-            if not mine.size:
-                continue
-            heads = _heads(stream.channel, stream.size, times[mine], first + mine + 1)
-            contents = stream.encode(int(done[i]), int(done[i]) + mine.size)
-            done[i] += mine.size
-            data[offsets[mine, None] + np.arange(stream.size)] = np.hstack([heads, contents])
-            index[stream.channel] = np.column_stack([times[mine], offsets[mine].astype(np.uint64)])
-        others: dict[int, list[tuple[int, int]]] = {}
-        for at in np.flatnonzero(which == len(self.streams)).tolist():
-            extra = self.extras[int(done[-1])]
-            done[-1] += 1
-            time, offset = int(times[at]), int(offsets[at])
-            publish = time if extra.publish is None else extra.publish
-            head = MESSAGE_HEAD.pack(
-                MESSAGE, 22 + len(extra.data), extra.channel, (first + at + 1) & 0xFFFFFFFF, time, publish
-            )
-            data[offset : offset + int(sizes[at])] = np.frombuffer(head + extra.data, np.uint8)
-            others.setdefault(extra.channel, []).append((time, offset))
-        index.update({channel: np.array(pairs, np.uint64) for channel, pairs in others.items()})
-        self.output.messages(data.tobytes(), index)
-
-
-_HEAD_TYPE = np.dtype([("o", "u1"), ("n", "<u8"), ("c", "<u2"), ("s", "<u4"), ("t", "<u8"), ("p", "<u8")])
-
-
-def _heads(channel: int, size: int, times: NDArray[np.uint64], sequence: NDArray[np.int64]) -> NDArray[np.uint8]:
-    heads = np.zeros(times.size, _HEAD_TYPE)
-    heads["o"], heads["n"], heads["c"] = MESSAGE, size - 9, channel
-    heads["s"] = sequence & 0xFFFFFFFF
-    heads["t"] = heads["p"] = times
-    return heads.view(np.uint8).reshape(times.size, _HEAD_TYPE.itemsize)
+def _write_merged(output: Output, streams: Sequence[_Stream], extras: Sequence[_Extra], clock: _Clock) -> None:
+    """Write all messages in one order, in chunks; sequence numbers are consecutive in the file."""
+    key = np.concatenate([np.empty(0), *(s.keys for s in streams)])
+    times = [clock.of(s.arrays[0].time[s.rows], s.arrays[0].host_time[s.rows]) for s in streams]
+    time = np.concatenate([np.empty(0), *times])
+    running = _running(time[np.argsort(key)])
+    ordered = np.sort(key)
+    newest = 0
+    for extra in extras:
+        if math.isnan(extra.key):
+            newest = max(newest, extra.log_time)
+            place = int(np.searchsorted(running, np.uint64(newest)))
+            extra.key = float(ordered[place]) - 0.5 if place < key.size else math.inf
+    extras = sorted(extras, key=lambda e: e.key)
+    which = np.concatenate([np.full(s.keys.size, i) for i, s in enumerate(streams)] + [np.full(len(extras), -1)])
+    order = np.argsort(np.concatenate([key, [e.key for e in extras]]), kind="stable")
+    which = which[order]
+    log_times = _running(np.concatenate([time, [e.log_time or math.nan for e in extras]])[order])
+    contents, others = [s.contents() for s in streams], iter(extras)
+    for first in range(0, which.size, _BLOCK_ROWS):
+        rows = slice(first, first + _BLOCK_ROWS)
+        for number, i, stamp in zip(itertools.count(first + 1), which[rows].tolist(), log_times[rows].tolist()):
+            if i >= 0:
+                output.message(streams[i].channel, stamp, next(contents[i]), sequence=number, publish_time=stamp)
+            else:
+                extra = next(others)
+                publish = stamp if extra.publish is None else extra.publish
+                output.message(extra.channel, stamp, extra.data, sequence=number, publish_time=publish)
 
 
 def _running(time: NDArray[np.float64]) -> NDArray[np.uint64]:
@@ -320,7 +245,7 @@ def _poses(
     extras, newest = [], -math.inf
     for row in np.argsort(places["position"]).tolist():
         time = float(position.time[row])
-        if not abs(time - newest) >= POSE_PERIOD:
+        if not abs(time - newest) >= schemas.POSE_PERIOD:
             continue
         # the latest attitude at the position, or the next sample in processing order
         at = int(np.searchsorted(known, places["position"][row] + 1, side="right")) - 1
@@ -332,7 +257,7 @@ def _poses(
         translation = dict(zip("xyz", position.value[row].tolist(), strict=True))
         nanoseconds = int(min(max(stamp, 0.0), 9.0e18))
         key = float(places["position"][row]) + 0.25
-        for topic, schema, fields in pose_messages(nanoseconds, translation, rotation):
+        for topic, schema, fields in schemas.pose_messages(nanoseconds, translation, rotation):
             extras.append(_Extra(_channel(output, topic, schema), schemas.encode(schema, fields), nanoseconds, key))
     return extras
 
@@ -341,10 +266,10 @@ def _events(output: Output, recording: Recording, clock: _Clock) -> list[_Extra]
     """Events as messages of their own kind if this is lossless, else as JSON."""
     extras = []
     for event in recording.events:
-        topic, schema = EVENT_TOPICS.get(event.kind, OTHER_EVENT_TOPIC)
+        topic, schema = schemas.EVENT_TOPICS.get(event.kind, schemas.OTHER_EVENT_TOPIC)
         data = _native(event)
         if data is None:
-            topic, schema = OTHER_EVENT_TOPIC
+            topic, schema = schemas.OTHER_EVENT_TOPIC
             fields = {"time": event.time, "kind": event.kind, "json": json.dumps(dict(event.data), default=str)}
             data = schemas.encode(schema, fields)
         stamp = _nanoseconds(event.time)
@@ -355,12 +280,12 @@ def _events(output: Output, recording: Recording, clock: _Clock) -> list[_Extra]
 
 def _native(event: Event) -> bytes | None:
     """The event as a message of its own kind, None if this would lose data."""
-    if event.kind not in EVENT_TOPICS or _nanoseconds(event.time) / 10**9 != event.time:
+    if event.kind not in schemas.EVENT_TOPICS or _nanoseconds(event.time) / 10**9 != event.time:
         return None
-    schema = EVENT_TOPICS[event.kind][1]
+    schema = schemas.EVENT_TOPICS[event.kind][1]
     try:
         data = schemas.encode(schema, event.data)
-        same = repr(fields_of(schemas.message_class(schema).FromString(data))) == repr(dict(event.data))
+        same = repr(schemas.fields_of(schemas.message_class(schema).FromString(data))) == repr(dict(event.data))
     except (TypeError, ValueError, AttributeError):
         return None
     return data if same else None
@@ -381,6 +306,6 @@ def _notes(output: Output, recording: Recording) -> list[_Extra]:
             "message": f"{finding.signal}: {finding.text}" if finding.signal else finding.text,
             "name": finding.check,
         }
-        channel = _channel(output, FINDINGS_TOPIC, "foxglove.Log")
+        channel = _channel(output, schemas.FINDINGS_TOPIC, "foxglove.Log")
         extras.append(_Extra(channel, schemas.encode("foxglove.Log", fields), log_time=0))
     return extras

@@ -54,27 +54,20 @@ class FixedMessages:
 
         A whole message must follow every offset.
         """
-        rows = np.empty((offsets.size, self.size), np.uint8)
+        rows = np.empty((0, self.size), np.uint8)
         if offsets.size:
-            from crazyem.recordings.mcap.kernel import gather  # numba takes a second to import
-
-            gather(data, offsets, rows)
+            rows = np.lib.stride_tricks.sliding_window_view(data, self.size)[offsets]
         sound = (rows[:, self._tags] == self._blank[self._tags]).all(axis=1)
         return rows.view(self._dtype)[:, 0], sound
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A signal in a stream, described as in `SignalArray`.
-
-    Attributes:
-        index: place among the signals of the recording.
-        components: names of the components; in a file, names of the fields.
-    """
+    """A signal in a stream, described as in `SignalArray`."""
 
     name: str
-    index: int
-    components: tuple[str, ...]
+    index: int  # place among the signals of the recording
+    components: tuple[str, ...]  # names of the components; in a file, names of the fields
     quantity: str = ""
     unit: str = ""
     frame: str = ""
@@ -89,19 +82,12 @@ class Column:
 
 @dataclass(frozen=True)
 class StreamLayout:
-    """The messages of one stream: time, host_time, marked, perhaps row, then the components of its signals.
+    """The messages of one stream: time, host_time, marked, perhaps row, then the components of its signals."""
 
-    Attributes:
-        identifier: a protobuf name, unique in the file.
-        stream: as in `SignalArray`.
-        signals: in processing order.
-        rows: messages contain their row in the arrays, because it differs from the processing order.
-    """
-
-    identifier: str
-    stream: str
-    signals: tuple[Column, ...]
-    rows: bool = False
+    identifier: str  # a protobuf name, unique in the file
+    stream: str  # as in `SignalArray`
+    signals: tuple[Column, ...]  # in processing order
+    rows: bool = False  # messages contain their row in the arrays, because it differs from the processing order
 
     @property
     def schema_name(self) -> str:

@@ -15,16 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from crazyem.errors import UsageError
 from crazyem.links.base import LinkStatistics, ParameterWrite
 from crazyem.recordings.mcap import schemas
-from crazyem.recordings.mcap.messages import (
-    EVENT_TOPICS,
-    FRAMES_TOPIC,
-    POSE_PERIOD,
-    PROFILE,
-    pose_messages,
-    timestamp,
-    versions,
-)
-from crazyem.recordings.mcap.output import Output
+from crazyem.recordings.mcap.output import Output, reopen
 from crazyem.signals.sample import Block, Packet, Sample
 from crazyem.signals.vocabulary import BlockDecoder, decoders
 
@@ -109,8 +100,6 @@ class RecordingWriter:
         self._thread.start()
 
     def _reopen(self, path: Path) -> None:
-        from crazyem.recordings.mcap.append import reopen
-
         before = reopen(path)
         self._file = before.stream
         self._output = Output(self._file, book=before.book, offset=before.offset)
@@ -119,8 +108,8 @@ class RecordingWriter:
 
     def _begin(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
         if self.session == 1:
-            self._output.start(PROFILE, f"crazyem {versions()['crazyem']}")
-        self._write_metadata("crazyem", versions())
+            self._output.start(schemas.PROFILE, f"crazyem {schemas.versions()['crazyem']}")
+        self._write_metadata("crazyem", schemas.versions())
         for section, entries in metadata.items():
             self._write_metadata(section, {k: str(v) for k, v in entries.items()})
         self._output.flush(sync=True)
@@ -155,7 +144,9 @@ class RecordingWriter:
 
     def parameter_write(self, write: ParameterWrite) -> None:
         """Record a write of a parameter and its result."""
-        self._put(self._write_parameter, write)
+        fields = {"host_time": write.host_time, "name": write.name, "verified": write.verified}
+        fields |= {"value": float(write.value), "echoed": math.nan if write.echoed is None else float(write.echoed)}
+        self._put(self._write, *schemas.EVENT_TOPICS["parameter_write"], write.host_time, fields)
 
     def estimate(self, estimate: "Estimate") -> None:
         """Record an update of the estimator."""
@@ -173,11 +164,17 @@ class RecordingWriter:
             values: (12,) position [m], velocity [m/s], attitude [rad], body rate [rad/s]; NaN where not measured.
             sd: (12,) their expected standard deviations.
         """
-        self._put(self._write_residual, time, _now(), tuple(map(float, values)), tuple(map(float, sd)))
+        fields = {"time": float(time), "host_time": _now()}
+        for name, value, deviation in zip(schemas.RESIDUALS.split(), values, sd, strict=True):
+            fields |= {name: float(value), f"{name}_sd": float(deviation)}
+        self._put(self._write, *schemas.EVENT_TOPICS["residual"], fields["host_time"], fields)
 
     def event(self, text: str, level: str = "INFO") -> None:
         """Record a message such as a phase of the flight or a warning; `level` as in foxglove.Log."""
-        self._put(self._write_event, _now(), text, level)
+        now = _now()
+        stamp = schemas.timestamp(_nanoseconds(now))
+        fields = {"timestamp": stamp, "level": level, "message": text, "name": "crazyem"}
+        self._put(self._write, *schemas.EVENT_TOPICS["log"], now, fields)
 
     def close(self) -> None:
         """Write all data and finish the file; may be called twice."""
@@ -265,13 +262,15 @@ class RecordingWriter:
             return
         self._message(known[0], packet.host_time, known[1].encode(packet))
         decoder = self._decoders.get(packet.block)
-        if decoder is not None and packet.firmware_time_ms / 1000.0 - self._pose_time >= POSE_PERIOD:
+        if decoder is not None and packet.firmware_time_ms / 1000.0 - self._pose_time >= schemas.POSE_PERIOD:
             self._write_pose(decoder.decode(packet))
 
     def _write_frame(self, host_time: float, data: bytes) -> None:
-        if FRAMES_TOPIC not in self._channels:
-            self._channels[FRAMES_TOPIC] = self._output.channel(FRAMES_TOPIC, "mavlink", 0)  # 0: there is no schema
-        self._message(self._channels[FRAMES_TOPIC], host_time, data)
+        if schemas.FRAMES_TOPIC not in self._channels:
+            self._channels[schemas.FRAMES_TOPIC] = self._output.channel(
+                schemas.FRAMES_TOPIC, "mavlink", 0
+            )  # 0: there is no schema
+        self._message(self._channels[schemas.FRAMES_TOPIC], host_time, data)
 
     def _write_pose(self, samples: list[Sample]) -> None:
         """foxglove.PoseInFrame and FrameTransform, for the 3D panels of viewers."""
@@ -287,7 +286,7 @@ class RecordingWriter:
         host_time = position.host_time
         translation = dict(zip("xyz", position.value, strict=True))
         rotation = dict(zip("xyzw", self._attitude, strict=True))
-        for topic, schema, fields in pose_messages(_nanoseconds(host_time), translation, rotation):
+        for topic, schema, fields in schemas.pose_messages(_nanoseconds(host_time), translation, rotation):
             self._write(topic, schema, host_time, fields)
 
     def _write_setpoint(self, time: float, host_time: float, reference: Setpoint) -> None:
@@ -295,41 +294,20 @@ class RecordingWriter:
         for what in ("position", "velocity", "acceleration"):
             for axis, value in zip("xyz", getattr(reference, what), strict=True):
                 fields[f"{what}_{axis}"] = float(value)
-        self._write(*EVENT_TOPICS["setpoint"], host_time, fields)
-
-    def _write_parameter(self, write: ParameterWrite) -> None:
-        fields = {
-            "host_time": write.host_time,
-            "name": write.name,
-            "value": float(write.value),
-            "echoed": math.nan if write.echoed is None else float(write.echoed),
-            "verified": write.verified,
-        }
-        self._write(*EVENT_TOPICS["parameter_write"], write.host_time, fields)
+        self._write(*schemas.EVENT_TOPICS["setpoint"], host_time, fields)
 
     def _write_estimate(self, host_time: float, estimate: "Estimate") -> None:
-        parameters = [
-            {
-                "name": name,
-                "value": float(p.value),
-                "sd": float(p.sd),
-                "ci95_low": float(p.ci95[0]),
-                "ci95_high": float(p.ci95[1]),
-                "unit": p.unit,
-                "identifiable": bool(p.identifiable),
-                "reason": p.reason,
-            }
-            for name, p in estimate.parameters.items()
-        ]
-        fields = {
-            "time": float(estimate.time),
-            "host_time": host_time,
-            "parameters": parameters,
-            "samples": int(estimate.samples),
-            "updates": int(estimate.updates),
-            "converged": bool(estimate.converged),
-        }
-        self._write(*EVENT_TOPICS["estimate"], host_time, fields)
+        parameters = []
+        for name, p in estimate.parameters.items():
+            numbers = dict(
+                zip(("value", "sd", "ci95_low", "ci95_high"), map(float, (p.value, p.sd, *p.ci95)), strict=True)
+            )
+            about = {"name": name, "unit": p.unit, "identifiable": bool(p.identifiable), "reason": p.reason}
+            parameters.append(about | numbers)
+        fields = {"time": float(estimate.time), "host_time": host_time, "parameters": parameters}
+        fields |= {"samples": int(estimate.samples), "updates": int(estimate.updates)}
+        fields["converged"] = bool(estimate.converged)
+        self._write(*schemas.EVENT_TOPICS["estimate"], host_time, fields)
 
     def _write_link(self, host_time: float, statistics: LinkStatistics, latency: float) -> None:
         names = ("received", "lost", "late", "round_trip", "clock_offset", "clock_rate", "outages")
@@ -341,18 +319,7 @@ class RecordingWriter:
             fields["rate"] = received / (host_time - before[0])
             fields["loss"] = lost / (received + lost) if received + lost > 0 else math.nan
         self._link_before = (host_time, statistics.received, statistics.lost)
-        self._write(*EVENT_TOPICS["link"], host_time, fields)
-
-    def _write_residual(self, time: float, host_time: float, values: tuple[float, ...], sd: tuple[float, ...]) -> None:
-        fields = {"time": float(time), "host_time": host_time}
-        for name, value, deviation in zip(schemas.RESIDUALS.split(), values, sd, strict=True):
-            fields |= {name: value, f"{name}_sd": deviation}
-        self._write(*EVENT_TOPICS["residual"], host_time, fields)
-
-    def _write_event(self, host_time: float, text: str, level: str) -> None:
-        stamp = timestamp(_nanoseconds(host_time))
-        fields = {"timestamp": stamp, "level": level, "message": text, "name": "crazyem"}
-        self._write(*EVENT_TOPICS["log"], host_time, fields)
+        self._write(*schemas.EVENT_TOPICS["link"], host_time, fields)
 
     def _write(self, topic: str, schema: str, host_time: float, fields: dict[str, Any]) -> None:
         self._message(self._channel(topic, schema), host_time, schemas.encode(schema, fields))

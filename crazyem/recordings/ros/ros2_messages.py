@@ -39,23 +39,14 @@ _Spec = dict[str, list[tuple[str, bool, int, str]]]  # type -> (type, array, fix
 
 @dataclass(frozen=True, slots=True)
 class MessageType:
-    """A message type and its decoder.
+    """A message type and its decoder."""
 
-    Attributes:
-        name: "geometry_msgs/PoseStamped".
-        decode: function from the bytes of a message to an object with its fields.
-        scalars: dotted names of the numbers.
-        arrays: dotted names and lengths of arrays of numbers; length 0 for sequences.
-        strings: dotted names of the texts.
-        stamped: whether there is a `header.stamp`.
-    """
-
-    name: str
-    decode: Callable[[bytes], Any]
-    scalars: tuple[str, ...]
-    arrays: tuple[tuple[str, int], ...]
-    strings: tuple[str, ...]
-    stamped: bool
+    name: str  # "geometry_msgs/PoseStamped"
+    decode: Callable[[bytes], Any]  # function from the bytes of a message to an object with its fields
+    scalars: tuple[str, ...]  # dotted names of the numbers
+    arrays: tuple[tuple[str, int], ...]  # dotted names and lengths of arrays of numbers; length 0 for sequences
+    strings: tuple[str, ...]  # dotted names of the texts
+    stamped: bool  # whether there is a `header.stamp`
 
 
 @functools.lru_cache(maxsize=64)  # making a decoder takes longer than reading a short bag
@@ -211,23 +202,15 @@ def _leaves(kind: str, spec: _Spec, prefix: str = "") -> Iterator[tuple[str, boo
 
 @dataclass(slots=True, eq=False)
 class Rows:
-    """Decoded messages of a topic.
+    """Decoded messages of a topic."""
 
-    Attributes:
-        columns: dotted name -> (n,) numbers; elements of arrays as "values[3]", NaN beyond the end of a short one.
-        stamp: (n,) `header.stamp`, ns since 1970, 0 if absent.
-        log: (n,) time of arrival at the recorder, ns since 1970.
-        objects: the decoded messages, if requested.
-        broken: number of messages that could not be decoded.
-        texts: dotted name -> text in the first message.
-    """
-
+    # dotted name -> (n,) numbers; elements of arrays as "values[3]", NaN beyond the end of a short one
     columns: dict[str, NDArray[np.float64]]
-    stamp: NDArray[np.int64]
-    log: NDArray[np.int64]
-    objects: list[Any]
-    broken: int
-    texts: dict[str, str]
+    stamp: NDArray[np.int64]  # (n,) `header.stamp`, ns since 1970, 0 if absent
+    log: NDArray[np.int64]  # (n,) time of arrival at the recorder, ns since 1970
+    objects: list[Any]  # the decoded messages, if requested
+    broken: int  # number of messages that could not be decoded
+    texts: dict[str, str]  # dotted name -> text in the first message
 
 
 def rows_of(kind: MessageType, messages: Sequence[tuple[int, bytes]], *, keep: bool = False) -> Rows:

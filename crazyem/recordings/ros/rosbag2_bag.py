@@ -16,10 +16,9 @@ from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader
 
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
-from crazyem.recordings.contents import ReadOptions
+from crazyem.recordings.contents import ReadOptions, head_of
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.mcap.scan import Loss, Problem
-from crazyem.recordings.mcap.survey import parts
+from crazyem.recordings.mcap.scan import Loss, Problem, parts
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.ros.ros2_messages import LARGEST_MESSAGE, MessageType, message_type, standard_definition
 from crazyem.recordings.ros.rosbag2_signals import ROBOT_TYPES, WORLD_TOPICS, BagMapping, BagTopic, recording_of
@@ -41,15 +40,15 @@ def read(path: Path, options: ReadOptions) -> Recording:
     mapping = _user_mapping(options.mapping)
     bag = _Bag()
     for file in _files(path):
-        if file.is_dir() or _is_sqlite(file):
+        if file.is_dir() or head_of(file).startswith(_SQLITE):
             bag.add_sqlite(file)
         else:
             bag.add(file)
     if not any(topic.messages for topic in bag.topics.values()):
         raise FileFormatError(f"{path}: the bag holds no messages that can be read ({bag.why_nothing()}).")
-    robot, others = _robot(path, bag, mapping)
+    robot = _robot(path, bag, mapping)
     chosen = [t for t in bag.topics.values() if t.name in WORLD_TOPICS or _owner(t.name) in (robot, "")]
-    return recording_of(path, chosen, robot, mapping, options.motor, (*bag.findings(), *others))
+    return recording_of(path, chosen, robot, mapping, options.motor, tuple(bag.findings()))
 
 
 def _files(path: Path) -> list[Path]:
@@ -66,11 +65,6 @@ def _files(path: Path) -> list[Path]:
     if any(path.glob("*.db3")):
         return [path]
     raise FileFormatError(f"{path}: the bag has neither an MCAP nor an SQLite file.")
-
-
-def _is_sqlite(path: Path) -> bool:
-    with path.open("rb") as stream:
-        return stream.read(len(_SQLITE)) == _SQLITE
 
 
 @dataclass(slots=True)
@@ -211,7 +205,7 @@ def _owner(topic: str) -> str:
     return parts[0] if len(parts) > 1 else ""
 
 
-def _robot(path: Path, bag: _Bag, mapping: BagMapping) -> tuple[str, list[Finding]]:
+def _robot(path: Path, bag: _Bag, mapping: BagMapping) -> str:
     """The robot to read: the only one, or the one that the user named."""
     owners = sorted(
         {_owner(t.name) for t in bag.topics.values() if t.messages and t.kind.name in ROBOT_TYPES} - {"all", ""}
@@ -220,13 +214,13 @@ def _robot(path: Path, bag: _Bag, mapping: BagMapping) -> tuple[str, list[Findin
     if mapping.robot is not None:
         if mapping.robot not in owners:
             raise UsageError(f'{path}: there is no robot "{mapping.robot}" in the bag; there are: {names or "none"}.')
-        return mapping.robot, []
+        return mapping.robot
     if len(owners) > 1:
         raise UsageError(
             f"{path}: the bag holds several robots ({names}); say which with a mapping file (--map) "
             f'that holds the line robot = "{text_of(owners[0])}".'
         )
-    return (owners[0] if owners else ""), []
+    return owners[0] if owners else ""
 
 
 def _user_mapping(file: str | None) -> BagMapping:

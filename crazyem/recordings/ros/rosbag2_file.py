@@ -4,10 +4,9 @@ from pathlib import Path
 
 from crazyem.extras import require
 from crazyem.recordings.contents import ReadOptions
-from crazyem.recordings.mcap.scan import HEAD, MCAP_MAGIC
+from crazyem.recordings.mcap.scan import MCAP_MAGIC, profile_of
 from crazyem.recordings.recording import Recording
 
-_PROFILE = b"ros2"
 _SQLITE = b"SQLite format 3\0"
 _METADATA = "metadata.yaml"
 
@@ -18,9 +17,7 @@ def recognises(head: bytes) -> bool:
         return b"topics" in head and b"messages" in head
     if not head.startswith(MCAP_MAGIC):
         return False
-    start = len(MCAP_MAGIC) + HEAD.size
-    length = int.from_bytes(head[start : start + 4], "little")
-    return head[start + 4 : start + 4 + length] == _PROFILE or b"\x07\0\0\0ros2msg" in head
+    return profile_of(head) == "ros2" or b"\x07\0\0\0ros2msg" in head
 
 
 def recognises_folder(path: Path) -> bool:

@@ -16,7 +16,7 @@ from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.ros.ros2_messages import MessageType, Rows, rows_of
-from crazyem.recordings.stamps import Fault, finding_in
+from crazyem.recordings.stamps import Fault, finding
 from crazyem.recordings.tables import Table, signals_from_tables
 from crazyem.recordings.topics import Mapped, Source, Topic, ranks, seconds, signals_of, text_of
 
@@ -135,6 +135,11 @@ def recording_of(
     mapped = [m if m.quantity in have else replace(m, origin="") for m in mapped]
     rest, left_out = signals_of([topic for _, topic in others], mapped)
     signals = _together(firmware, rest, {_label(d): d.order for d in decoded})
+    broken = [
+        note("integrity", f"{n} messages of {text_of(d.topic.name)} do not fit their type.", Grade.DEGRADES, messages=n)
+        for d in decoded
+        if (n := d.rows.broken)
+    ]
     about = {"robot": robot, "topics": " ".join(sorted(text_of(t.name) for t in topics))[:4000], **clocks}
     return Recording(
         str(path),
@@ -143,8 +148,8 @@ def recording_of(
         {"rosbag2": about, **meaning.metadata},
         (
             *findings,
-            *_damage(decoded),
-            *finding_in([d.fault() for d in decoded if d.moved and d.clock == HOST_CLOCK], signals),
+            *broken,
+            *finding([d.fault() for d in decoded if d.moved and d.clock == HOST_CLOCK], signals),
             *clock_notes,
             *log_notes,
             *meaning.findings,
@@ -156,22 +161,15 @@ def recording_of(
     )
 
 
-def _damage(decoded: Sequence[_Decoded]) -> list[Finding]:
-    broken = [(text_of(d.topic.name), d.rows.broken) for d in decoded if d.rows.broken]
-    return [
-        note("integrity", f"{n} messages of {name} do not fit their type.", Grade.DEGRADES, messages=float(n))
-        for name, n in broken
-    ]
-
-
 _PREFERRED = {"mocap": 1, "tf": 2}
 # crazyflie_server.py: `_log_odom_data_callback` copies gyro.* and stabilizer.pitch as the firmware logs them
-text = (
+_PYTHON_SERVER = note(
+    "mapping",
     "The odometry looks like that of crazyswarm2's Python server, which wrote rates in deg/s and the firmware's "
-    "inverted pitch; it is read as published."
+    "inverted pitch; it is read as published.",
+    Grade.DEGRADES,
+    "Run crazyem doctor, which tells from the numbers; prefer log blocks.",
 )
-advice = "Run crazyem doctor, which tells from the numbers; prefer log blocks."
-_PYTHON_SERVER = Finding("mapping", Grade.DEGRADES, text, "", (), {}, advice)
 
 
 def _label(d: _Decoded) -> str:

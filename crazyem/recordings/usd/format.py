@@ -5,8 +5,7 @@ NUL, number of variables u16, and their names "group.variable(T)" ending in NUL,
 Records follow: id u16, time stamp (version 1: u32 ms; version 2, since 2021-03-18: u64 us), packed values. The last 4
 bytes are the CRC-32 of everything before them. Source: src/deck/drivers/src/usddeck.c of crazyflie-firmware.
 
-Only the id of a record gives its length, so the records must be located one after the other. Most logs have long runs
-of one kind; one comparison locates a whole run. Alternating kinds need a plain loop (0.3 us per record).
+Only the id of a record gives its length, so the records must be located one after the other (0.3 us per record).
 """
 
 from array import array
@@ -42,21 +41,13 @@ LONGEST_NAME = 256  # bytes
 
 @dataclass(frozen=True, slots=True)
 class EventType:
-    """A kind of record.
+    """A kind of record."""
 
-    Attributes:
-        identifier: first two bytes of its records; 0xFFFF is "fixedFrequency".
-        name: unique in the file.
-        variables: unique in the event; names without a "." are the payload of the event.
-        letters: type letter of each variable.
-        layout: of a whole record; fields "id", "stamp", "0", "1", ...
-    """
-
-    identifier: int
-    name: str
-    variables: tuple[str, ...]
-    letters: tuple[str, ...]
-    layout: np.dtype[np.void]
+    identifier: int  # first two bytes of its records; 0xFFFF is "fixedFrequency"
+    name: str  # unique in the file
+    variables: tuple[str, ...]  # unique in the event; names without a "." are the payload of the event
+    letters: tuple[str, ...]  # type letter of each variable
+    layout: np.dtype[np.void]  # of a whole record; fields "id", "stamp", "0", "1", ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +65,11 @@ def parse_header(data: bytes, path: object) -> Header:
     Raises: FileFormatError naming `path` and the first invalid byte of the header.
     """
     cursor = _Cursor(data, path)
-    if cursor.u8("magic byte") != USD_MAGIC:
+    if not data:
+        raise cursor.cut("magic byte")
+    if data[0] != USD_MAGIC:
         raise FileFormatError(f"{path} does not start with 0xBC, as a uSD card log does.")
+    cursor.at = 1
     version = cursor.u16("version")
     if version not in USD_VERSIONS:
         raise FileFormatError(f"{path}: uSD card log of version {version}, known are 1 and 2.")
@@ -95,7 +89,8 @@ def parse_header(data: bytes, path: object) -> Header:
 
 def _event(cursor: "_Cursor", version: int, taken: set[str]) -> EventType:
     identifier = cursor.u16("event id")
-    name = _unique(cursor.name("event name"), taken, f"@{identifier}")
+    name = cursor.name("event name")
+    name += f"@{identifier}" if name in taken else ""
     count = cursor.u16(f"number of variables of {name}")
     if count > _MOST_VARIABLES:
         raise FileFormatError(f"{cursor.path}: the header declares {count} variables in {name} (byte {cursor.at - 2}).")
@@ -108,15 +103,11 @@ def _event(cursor: "_Cursor", version: int, taken: set[str]) -> EventType:
         if text[-3:-2] != "(" or text[-1:] != ")" or letter not in TYPE_LETTERS:
             raise FileFormatError(f'{cursor.path}: "{text[:40]}" (byte {start}) is not a variable with a known type.')
         # a variable may occur twice in an event, as two samples microseconds apart
-        variables.append(_unique(variable, set(variables), f"#{len(variables)}"))
+        variables.append(variable + (f"#{len(variables)}" if variable in variables else ""))
         letters.append(letter)
     fields = [("id", "<u2"), ("stamp", STAMP_TYPES[version][0])]
     fields += [(str(i), TYPE_LETTERS[letter][0]) for i, letter in enumerate(letters)]
     return EventType(identifier, name, tuple(variables), tuple(letters), np.dtype(fields))
-
-
-def _unique(name: str, taken: set[str], suffix: str) -> str:
-    return name + suffix if name in taken else name
 
 
 class _Cursor:
@@ -125,55 +116,39 @@ class _Cursor:
     def __init__(self, data: bytes, path: object) -> None:
         self.data, self.path, self.at = data, path, 0
 
-    def u8(self, what: str) -> int:
-        return self._take(1, what)[0]
-
     def u16(self, what: str) -> int:
-        return int.from_bytes(self._take(2, what), "little")
+        if self.at + 2 > len(self.data):
+            raise self.cut(what)
+        self.at += 2
+        return int.from_bytes(self.data[self.at - 2 : self.at], "little")
 
     def name(self, what: str) -> str:
         """The text up to the next NUL; the cursor moves behind the NUL."""
         end = self.data.find(0, self.at, self.at + LONGEST_NAME)
         if end < 0 and len(self.data) < self.at + LONGEST_NAME:
-            raise self._cut(what)
+            raise self.cut(what)
         text = self.data[self.at : end]
         if end < 0 or not text.isascii() or not text.decode("ascii").isprintable():
             raise FileFormatError(f"{self.path}: the {what} at byte {self.at} is not text.")
         self.at = end + 1
         return text.decode("ascii")
 
-    def _take(self, count: int, what: str) -> bytes:
-        taken = self.data[self.at : self.at + count]
-        if len(taken) < count:
-            raise self._cut(what)
-        self.at += count
-        return taken
-
-    def _cut(self, what: str) -> FileFormatError:
+    def cut(self, what: str) -> FileFormatError:
         return FileFormatError(f"{self.path} ends after {len(self.data)} bytes, in its header ({what}).")
 
 
 BLANK_BYTES = (b"\xff", b"\x00")  # erased flash; reserved clusters that were never written
-_RUN_RECORDS = 16  # consecutive records of one kind before a run is tested
-_WINDOW_RECORDS = 1 << 16  # most records in one comparison; bounds its memory
-_GATHERED_BYTES = 1 << 22  # memory [bytes] for one copy of records that are not adjacent
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Records:
-    """Whole records in file order.
+    """Whole records in file order."""
 
-    Attributes:
-        start: (n,) first byte of each record.
-        kind: (n,) index of the event type of each record.
-        stop: byte after the last whole record.
-        unknown: the event id found at `stop`, None if the data end there.
-    """
-
-    start: NDArray[np.int64]
-    kind: NDArray[np.uint16]
-    stop: int
-    unknown: int | None
+    start: NDArray[np.int64]  # (n,) first byte of each record
+    kind: NDArray[np.uint16]  # (n,) index of the event type of each record
+    order: list[NDArray[np.intp]]  # rows of each kind among these records
+    stop: int  # byte after the last whole record
+    unknown: int | None  # the event id found at `stop`, None if the data end there
 
 
 def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int, blank: int) -> Records:
@@ -181,64 +156,29 @@ def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int, bla
 
     Records that begin at byte `blank` or later are left out: erased flash looks like records of event 0xFFFF.
     """
-    sizes = {event.identifier.to_bytes(2, "little"): event.layout.itemsize for event in events}
-    start = array("q")
-    append = start.append
-    at, previous, streak = begin, b"", 0
-    while True:
-        identifier = data[at : at + 2]
-        size = sizes.get(identifier)
-        if size is None or at + size > end:
+    known = {event.identifier.to_bytes(2, "little"): (k, event.layout.itemsize) for k, event in enumerate(events)}
+    start, kind = array("q"), array("H")
+    at = begin
+    while at < blank:
+        k, size = known.get(data[at : at + 2], (0, end + 1))
+        if at + size > end:
             break
-        if identifier != previous:
-            previous, streak = identifier, 0
-        streak += 1
-        if streak < _RUN_RECORDS:
-            append(at)
-            at += size
-            continue
-        run = _run(data, at, end, size, int.from_bytes(identifier, "little"))
-        start.frombytes(np.arange(at, at + run * size, size, dtype=np.int64).tobytes())
-        at += run * size
-        streak = _RUN_RECORDS - 1 if run == _WINDOW_RECORDS else 0  # full window: the run may continue
-    starts = np.frombuffer(start, np.int64)
-    unknown = int.from_bytes(identifier, "little") if size is None and at + 2 <= end else None
-    count = int(np.searchsorted(starts, blank))
-    if count < starts.size:
-        starts, at, unknown = starts[:count], int(starts[count]), None
-    return Records(starts, _kinds(data, events, starts), at, unknown)
-
-
-def _kinds(data: bytes, events: tuple[EventType, ...], start: NDArray[np.int64]) -> NDArray[np.uint16]:
-    """(n,) index of the event type of each record."""
-    kinds = np.zeros(start.size, np.uint16)
-    if len(events) > 1:
-        source = np.frombuffer(data, np.uint8)
-        identifiers = source[start] | source[start + 1].astype(np.uint16) << 8
-        for i, event in enumerate(events):
-            kinds[identifiers == event.identifier] = i
-    return kinds
-
-
-def _run(data: bytes, at: int, end: int, size: int, identifier: int) -> int:
-    """Length of the run of whole records of one kind that starts at `at`, at most a window."""
-    count = min((end - at) // size, _WINDOW_RECORDS)
-    same = np.ndarray((count,), "<u2", data, at, (size,)) == identifier
-    return count if same.all() else int(np.argmin(same))
+        start.append(at)
+        kind.append(k)
+        at += size
+    unknown = data[at : at + 2] not in known and at + 2 <= end
+    kinds = np.frombuffer(kind, np.uint16)
+    order = [np.flatnonzero(kinds == k) for k in range(len(events))]
+    identifier = int.from_bytes(data[at : at + 2], "little") if unknown else None
+    return Records(np.frombuffer(start, np.int64), kinds, order, at, identifier)
 
 
 def gather(data: bytes, event: EventType, start: NDArray[np.int64]) -> NDArray[np.void]:
-    """(n,) records of one kind; a view of `data` if they are adjacent, else a copy."""
-    size = event.layout.itemsize
-    if start.size and int(start[-1]) - int(start[0]) == (start.size - 1) * size:
-        return np.frombuffer(data, event.layout, start.size, int(start[0]))
-    source = np.frombuffer(data, np.uint8)
-    result = np.empty((start.size, size), np.uint8)
-    step = max(1, _GATHERED_BYTES // (8 * size))
-    for first in range(0, start.size, step):
-        rows = start[first : first + step]
-        result[first : first + step] = source[rows[:, None] + np.arange(size)]
-    return result.reshape(-1).view(event.layout)
+    """(n,) records of one kind, copied."""
+    if not start.size:
+        return np.empty(0, event.layout)
+    windows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(data, np.uint8), event.layout.itemsize)
+    return windows[start].reshape(-1).view(event.layout)
 
 
 class Clock:
