@@ -14,7 +14,7 @@ from crazyem.errors import FileFormatError
 from crazyem.recordings import ReadOptions, Recording, open_recording
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.finding import percent
-from crazyem.recordings.parts import open_parts
+from crazyem.recordings.registry import open_parts
 
 CASES = Path(__file__).parent / "cases"
 MAP = CASES / "map.toml"

@@ -23,12 +23,7 @@ from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.recordings import Grade, ReadOptions, Recording, SignalArray, open_recording
 from crazyem.recordings.csv.exported import read, read_parts
 from crazyem.recordings.export import METADATA_SUFFIX, export, export_parts
-<<<<<<< HEAD
-from crazyem.recordings.parts import free_memory, is_large, open_parts
-=======
 from crazyem.recordings.registry import free_memory, is_large, open_parts
-from crazyem.signals.sample import SIGNALS
->>>>>>> 4e23a72837563664aa52e760fca6682d249113ba
 
 ODD = [
     "pm.vbatMV", "a,b", 'quote"d', "two\nlines", "tab\t", "Größe", "time", "host_time", "position_x", "x [m]", "",

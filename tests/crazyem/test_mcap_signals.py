@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from crazyem.errors import UsageError
 from crazyem.recordings import Event, Finding, Fix, Grade, ReadOptions, Recording, SignalArray, open_recording
 from crazyem.recordings.mcap import file as mcap_file
-from crazyem.recordings.mcap.findings import findings_from_json, findings_to_json
+from crazyem.recordings.mcap.schemas import findings_from_json, findings_to_json
 from crazyem.recordings.mcap.signals import write_recording
 from crazyem.recordings.mcap.stream_codec import unique_name
 from crazyem.signals.sample import SIGNALS

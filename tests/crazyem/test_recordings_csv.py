@@ -15,8 +15,8 @@ from crazyem.errors import CrazyemError, DataError, FileFormatError
 from crazyem.recordings import open_recording
 from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.csv import file as csv_file
-from crazyem.recordings.csv.signals import corners, interpolated_rows
 from crazyem.recordings.csv.mapping import known_mappings
+from crazyem.recordings.csv.signals import corners, interpolated_rows
 from crazyem.signals.sample import ESTIMATOR_SIGNALS
 
 NANOBENCH = [

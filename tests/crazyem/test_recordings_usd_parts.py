@@ -147,3 +147,11 @@ def test_a_header_longer_than_a_piece_and_one_that_never_ends(tmp_path, monkeypa
     monkeypatch.setattr("crazyem.recordings.usd.file._LONGEST_HEADER", 1000)
     with pytest.raises(FileFormatError, match="not text"):
         list(read_parts(path, ReadOptions()))
+
+
+def test_real_logs_in_parts(shared_recordings, monkeypatch):
+    monkeypatch.setattr("crazyem.recordings.usd.file._READ_BYTES", 10_007)
+    for path in [*sorted((shared_recordings / "crazypad").iterdir())[:3], shared_recordings / "sysid" / "log10"]:
+        parts = list(read_parts(path, ReadOptions(), seconds=4.0))
+        assert len(parts) > 2
+        assert_joined(parts, read(path, ReadOptions()))
