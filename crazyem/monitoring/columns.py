@@ -60,6 +60,15 @@ def mixing(vehicle: Vehicle) -> NDArray[np.float64]:
     return np.stack([np.ones(4), y * ROLL_SIGN, x * PITCH_SIGN, vehicle.torque_per_thrust * YAW_SIGN])
 
 
+def lateness(tape: Tape, first: int, last: int) -> NDArray[np.float64]:
+    """(n, 12) additions to measured position, velocity, attitude and body rate that are late by one second, to first
+    order: less their derivatives."""
+    now, before = tape.xp[first:last], tape.xf[first - 1 : last - 1]
+    span = (tape.time[first:last] - tape.time[first - 1 : last - 1])[:, None]
+    acceleration, turning = (now[:, 3:6] - before[:, 3:6]) / span, (now[:, 10:13] - before[:, 10:13]) / span
+    return -np.concatenate([now[:, 3:6], acceleration, now[:, 10:13], turning], axis=1)
+
+
 class RowMaker:
     """Computes the rows of columns and nuisances for a vehicle.
 
@@ -121,6 +130,8 @@ class RowMaker:
                 sensed[:, c, 3:6] = tape.xp[first:last, 3:6]
             elif kind == h.RATE_SCALE:
                 sensed[:, c, 9:12] = tape.xp[first:last, 10:13]
+            elif kind == h.LATENESS:
+                sensed[:, c] = lateness(tape, first, last)
         return acting, sensed
 
     def nuisances(
@@ -157,10 +168,9 @@ class RowMaker:
         for a in range(3):
             acting[:, 9 + a, a] = -velocity[:, a]
         span = (tape.time[first:last] - tape.time[first - 1 : last - 1])[:, None]
-        sensed[:, 12, 0:3] = -tape.xp[first:last, 3:6]
-        sensed[:, 13, 3:6] = -(tape.xp[first:last, 3:6] - tape.xf[first - 1 : last - 1, 3:6]) / span
-        sensed[:, 14, 6:9] = -tape.xp[first:last, 10:13]
-        sensed[:, 15, 9:12] = -(tape.xp[first:last, 10:13] - w) / span
+        late = lateness(tape, first, last)
+        for a in range(4):
+            sensed[:, 12 + a, 3 * a : 3 * a + 3] = late[:, 3 * a : 3 * a + 3]
         sensed[:, 16, 3:6] = tape.xp[first:last, 3:6]
         sensed[:, 17, 9:12] = tape.xp[first:last, 10:13]
         lateral = np.einsum("nij,nj->ni", tape.middle[first:last, :, :2], velocity[:, :2])
