@@ -110,6 +110,7 @@ class Detector:
         self._since = time
         self._newest = -math.inf
         self._found: tuple[float, float] | None = None  # s, detection and onset of a change
+        self._exceeded = False  # whether a test was above its threshold at the last judgement
         self._reported = False
         self.drift[:], self.n[:], self.n_slow[:], self.e_slow[:] = 0.0, 0.0, 0.0, 0.0
 
@@ -221,6 +222,8 @@ class Detector:
         self.holds = bool(over.max() <= 1.0)
         if self.holds:
             self._learn(levels, excess, passed)
+        if self.holds or not self._exceeded:  # a single row that deviates is no change: later rows contradict it
+            self._exceeded = not self.holds
             return None
         report = self._report(now, slots, scale, settled=False)
         self._found = (now, report.onset)

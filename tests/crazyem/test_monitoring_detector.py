@@ -129,6 +129,14 @@ def test_measurements_that_become_late_by_a_sample_are_named(flight: list[Sample
 
 
 @pytest.mark.slow
+def test_a_single_velocity_that_deviates_is_no_change(flight: list[Sample]) -> None:
+    at = next(s.time for s in flight if s.signal == "velocity" and s.time >= ONSET)
+    here = [s.signal == "velocity" and s.time == at for s in flight]
+    one = [replace(s, value=(s.value[0] + 0.1, *s.value[1:])) if h else s for s, h in zip(flight, here, strict=True)]
+    assert monitored(one)[0] == []
+
+
+@pytest.mark.slow
 def test_a_change_of_a_size_that_is_normal_is_no_fault_however_certain(
     flight: list[Sample], monkeypatch: pytest.MonkeyPatch
 ) -> None:
