@@ -129,11 +129,23 @@ def test_measurements_that_become_late_by_a_sample_are_named(flight: list[Sample
 
 
 @pytest.mark.slow
-def test_a_single_velocity_that_deviates_is_no_change(flight: list[Sample]) -> None:
-    at = next(s.time for s in flight if s.signal == "velocity" and s.time >= ONSET)
-    here = [s.signal == "velocity" and s.time == at for s in flight]
-    one = [replace(s, value=(s.value[0] + 0.1, *s.value[1:])) if h else s for s, h in zip(flight, here, strict=True)]
-    assert monitored(one)[0] == []
+@pytest.mark.parametrize(("judgements", "reported"), [(1, False), (2, True)])
+def test_a_change_is_reported_by_two_judgements_in_a_row(
+    flight: list[Sample], monkeypatch: pytest.MonkeyPatch, judgements: int, reported: bool
+) -> None:
+    judge, above = Detector._judge, iter([False] * 20 + [True] * judgements)
+
+    def lowered(self: Detector, *arguments: Any) -> Fault | None:
+        """Judge against thresholds near 0 where a test must be above its threshold."""
+        kept = self.threshold
+        if next(above, False):
+            self.threshold = np.full_like(kept, 1e-9)
+        found = judge(self, *arguments)
+        self.threshold = kept
+        return found
+
+    monkeypatch.setattr(Detector, "_judge", lowered)
+    assert bool(monitored(s for s in flight if s.time < 12.0)[0]) is reported
 
 
 @pytest.mark.slow
