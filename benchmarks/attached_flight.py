@@ -32,8 +32,8 @@ from crazyem.estimation.online import OnlineEstimator
 from crazyem.estimation.steps import StepAwareEstimator
 from crazyem.links.base import Block, LinkLost, LinkStatistics, Packet, ParameterWrite, Variable
 from crazyem.live.attach import Attachment
+from crazyem.live.runner import warm_up
 from crazyem.live.session import Session
-from crazyem.live.warm_up import warm_up
 from crazyem.vehicle import load_vehicle
 from firmware_sim.commander import setpoint as sp
 from firmware_sim.commander.setpoint import CRTP

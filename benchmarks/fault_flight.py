@@ -30,8 +30,8 @@ from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.guard import INERTIA_NAMES, Decision
 from crazyem.live.policy import FaultRules
 from crazyem.live.recorder import open_recorder
+from crazyem.live.runner import warm_up
 from crazyem.live.session import Session
-from crazyem.live.warm_up import warm_up
 from crazyem.live.write_supervisor import WriteRules
 from crazyem.recordings import open_recording
 from crazyem.signals.sample import Sample

@@ -152,9 +152,9 @@ def prefeed(link: StreamLink, watched: Watched) -> None:
 
 def run_streams(count: int, *, seconds: float, workers: int | None, record: bool, window: int, cold: bool) -> Any:
     """Measure one number of drones; returns raw numbers."""
+    from crazyem.live.runner import warm_up
     from crazyem.live.scheduler import Scheduler
     from crazyem.live.swarm import shorten_switch_interval
-    from crazyem.live.warm_up import warm_up
     from crazyem.vehicle import load_vehicle
 
     warm_up(load_vehicle("cf2"))
@@ -216,9 +216,9 @@ def _twin(link: StreamLink, number: int) -> StreamLink:
 def run_simulator(count: int, *, seconds: float, workers: int | None, record: bool, window: int) -> Any:
     """The same over UDP and cflib: the swarm simulator runs on the same cores, each drone hovers."""
     from crazyem.links import open_link
+    from crazyem.live.runner import warm_up
     from crazyem.live.scheduler import Scheduler
     from crazyem.live.swarm import shorten_switch_interval
-    from crazyem.live.warm_up import warm_up
     from crazyem.vehicle import load_vehicle
 
     warm_up(load_vehicle("cf2"))

@@ -17,10 +17,9 @@ from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.flight_result import FlightResult
 from crazyem.live.policy import Policy, load_policy
 from crazyem.live.recorder import Recorder
-from crazyem.live.runner import connect, finished, open_session
+from crazyem.live.runner import connect, finished, open_session, warm_up
 from crazyem.live.session import LOG_RATE, RECONNECT_WITHIN, Session
 from crazyem.live.simulator import Simulator
-from crazyem.live.warm_up import warm_up
 from crazyem.live.write_supervisor import WriteRules
 from crazyem.monitoring.fault import Fault
 from crazyem.physics import folding

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from crazyem.extras import MissingExtraError, require
-from crazyem.live.flight_result import FlightResult
+from crazyem.live.flight_result import FlightResult, live_line, write_json
 from crazyem.live.history import History
-from crazyem.live.summary import live_line, write_json
 from crazyem.monitoring.fault import Fault
 from crazyem.vehicle import Vehicle
 
@@ -122,7 +121,7 @@ def new_estimator(vehicle: Vehicle, arguments: argparse.Namespace, *, crazyflie:
 
 def compile_kernels(vehicle: Vehicle) -> None:
     """Compile the estimator before flight, and print a line if compiling was necessary."""
-    from crazyem.live.warm_up import warm_up
+    from crazyem.live.runner import warm_up
 
     if seconds := warm_up(vehicle):
         say(f"compiled the estimator in {seconds:.0f} s (once per installation)")

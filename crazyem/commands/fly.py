@@ -6,14 +6,22 @@ from collections.abc import Iterator
 
 from crazyem.api.flying import FlightObserver, FlightSettings, Progress, observed_flight
 from crazyem.commands.common import LiveLine, plot_path, report, say
-from crazyem.commands.flights import interrupts, write_rules
-from crazyem.commands.view import Stream, SwarmInterrupts, Viewed, live_stream, live_view, wants_view
+from crazyem.commands.flights import (
+    Stream,
+    SwarmInterrupts,
+    Viewed,
+    interrupts,
+    live_stream,
+    live_view,
+    wants_view,
+    write_rules,
+)
 from crazyem.control.named_trajectories import duration_note, trajectory_maker
 from crazyem.errors import CrazyemError
 from crazyem.live.flight import FlightInterruptedError, Interrupts, MotorsCutError
+from crazyem.live.flight_result import check_writable
 from crazyem.live.recorder import Recorder
 from crazyem.live.session import Session
-from crazyem.live.summary import check_writable
 from crazyem.physics import folding
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from crazyem.atomic_file import write_file
 from crazyem.errors import UsageError
-from crazyem.live.summary import check_writable, write_json
+from crazyem.live.flight_result import check_writable, write_json
 from crazyem.recordings.finding import Finding, Grade
 
 # s until progress is first shown, and between progress lines outside a terminal

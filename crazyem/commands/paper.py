@@ -133,8 +133,7 @@ def write_results(folder: Path, results: dict[str, Any]) -> None:
 
 
 def _summary(results: dict[str, Any], folder: Path) -> None:
-    from crazyem.paper.pages import notes
-    from crazyem.paper.table_text import table_grid
+    from crazyem.paper.pages import notes, table_grid
 
     for table in ("II", "III", "IV", "V"):
         grid = table_grid(results["cells"], table)

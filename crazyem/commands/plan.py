@@ -6,7 +6,7 @@ from crazyem.atomic_file import write_file
 from crazyem.commands.common import names_in, say
 from crazyem.commands.output import put
 from crazyem.errors import CrazyemError, UsageError
-from crazyem.live.summary import check_writable, write_json
+from crazyem.live.flight_result import check_writable, write_json
 
 
 class NoManoeuvreError(CrazyemError):

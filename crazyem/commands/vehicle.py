@@ -9,7 +9,7 @@ from crazyem.commands.common import names_in, say
 from crazyem.commands.files import read_options
 from crazyem.commands.output import deliver
 from crazyem.errors import DataError, UsageError
-from crazyem.live.summary import check_writable
+from crazyem.live.flight_result import check_writable
 
 BY_SUFFIX = {".urdf": "gym-pybullet-drones", ".sdf": "gazebo", ".py": "rotorpy"}
 
@@ -79,8 +79,7 @@ def _sample(arguments: argparse.Namespace) -> int:
 
     from crazyem.commands.predict import write
     from crazyem.physics import folding
-    from crazyem.simulators.convert import convert, read_text
-    from crazyem.simulators.registry import FORMATS, OWN
+    from crazyem.simulators.convert import FORMATS, OWN, convert, read_text
     from crazyem.simulators.sampling import MASS_SD, sample
 
     vehicle = folding.load(arguments.file)
@@ -117,8 +116,7 @@ def _sample(arguments: argparse.Namespace) -> int:
 
 def _several(source: str, form: str | None) -> list[str]:
     """Names of the drones in a source; empty if its format has no names."""
-    from crazyem.simulators.convert import read_text
-    from crazyem.simulators.registry import OWN, format_named, format_of
+    from crazyem.simulators.convert import OWN, format_named, format_of, read_text
     from crazyem.vehicle import preset_names
 
     if source in preset_names():
@@ -130,7 +128,7 @@ def _several(source: str, form: str | None) -> list[str]:
 
 def _target_format(arguments: argparse.Namespace, template: str | None) -> str:
     """The output format from the template or the suffix. Raises UsageError if both are ambiguous."""
-    from crazyem.simulators.registry import NAMES, format_of
+    from crazyem.simulators.convert import NAMES, format_of
 
     if template is not None:
         return format_of(template, where=arguments.template)

@@ -9,17 +9,25 @@ import contextlib
 import math
 
 from crazyem.commands.common import LiveLine, compile_kernels, new_estimator, plot_path, report, say
-from crazyem.commands.flights import confirm_in_terminal, follow, interrupts
-from crazyem.commands.view import Stream, Viewed, live_stream, live_view, wants_view
+from crazyem.commands.flights import (
+    Stream,
+    Viewed,
+    confirm_in_terminal,
+    follow,
+    interrupts,
+    live_stream,
+    live_view,
+    wants_view,
+)
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
 from crazyem.links.base import Link
 from crazyem.live.flight_monitor import monitor_for
+from crazyem.live.flight_result import check_writable
 from crazyem.live.hover_thrust import hover_afterwards
 from crazyem.live.policy import Policy, load_policy
 from crazyem.live.runner import connect, finished, open_session
 from crazyem.live.session import Session
-from crazyem.live.summary import check_writable
 from crazyem.live.telemetry import FLYING
 from crazyem.live.write_supervisor import WriteRules
 from crazyem.physics import folding

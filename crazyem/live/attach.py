@@ -116,7 +116,7 @@ def attach(
     """
     from crazyem.estimation.steps import estimator_for
     from crazyem.links.crazyflie import CrazyflieLink
-    from crazyem.live.warm_up import warm_up
+    from crazyem.live.runner import warm_up
 
     rules = WriteRules(policy if isinstance(policy, Policy) else load_policy(policy), dry_run=dry_run)
     model, left_out = folding.fold(vehicle if isinstance(vehicle, Vehicle) else folding.load(vehicle))

@@ -14,7 +14,7 @@ from crazyem.links.base import Link, ParameterWrite
 from crazyem.live.controllers import CONTROLLERS, Controller, for_vehicle, with_drag, without_target, writes_back
 from crazyem.live.guard import Decision, Guard
 from crazyem.live.history import History, Push
-from crazyem.live.write_gate import WriteGate
+from crazyem.live.telemetry import WriteGate
 from crazyem.vehicle import Vehicle
 
 ONBOARD_DRAG = ("kalman.dragB_x", "kalman.dragB_y")

@@ -38,8 +38,7 @@ from crazyem.live.policy import load_policy
 from crazyem.live.push import Pusher, nominal_estimates, push_target, read_originals
 from crazyem.live.recorder import FrameRecorder, Recorder
 from crazyem.live.scheduler import Scheduler
-from crazyem.live.telemetry import Telemetry
-from crazyem.live.write_gate import WriteGate
+from crazyem.live.telemetry import Telemetry, WriteGate
 from crazyem.live.write_supervisor import WriteRules, WriteSupervisor
 from crazyem.monitoring.fault import Fault
 from crazyem.signals.sample import Sample

@@ -1,6 +1,12 @@
-"""Convert a vehicle to a simulator's file and back; report what the file cannot hold and the error this causes."""
+"""Convert a vehicle to a simulator's file and back; report what the file cannot hold and the error this causes.
 
+Every `Format` in a module of `formats/` is known by its name, and recognised by its text.
+"""
+
+import importlib
 import math
+import pkgutil
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,13 +16,57 @@ from crazyem.physics import folding
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.supply import THRUST_CURVE
 from crazyem.recordings.recording import Recording
-from crazyem.simulators.constants import Constants, from_vehicle, to_vehicle, without_effects
+from crazyem.simulators.constants import Constants, from_vehicle, impossible, objection, to_vehicle, without_effects
 from crazyem.simulators.cost import HORIZON, errors_after, flown, reference_flight, rms_distance, said, to_json
 from crazyem.simulators.fields import Contradiction, Format, SimulatorFile, read, write
 from crazyem.simulators.formats.rotorpy import ROTORPY, ROTORPY_JSON
-from crazyem.simulators.plausible import impossible, objection
-from crazyem.simulators.registry import FORMATS, OWN, format_named, format_of
 from crazyem.vehicle import Vehicle, preset_names
+
+OWN = "crazyem"  # a vehicle file
+
+
+def discover(paths: Iterable[str], package: str = "") -> dict[str, Format]:
+    """Every `Format` in the modules of some folders, sorted by `order` and name.
+
+    Args:
+        paths: folders.
+        package: dotted name of the package of these folders; empty: top level.
+    """
+    modules = pkgutil.iter_modules(list(paths), f"{package}." if package else "")
+    found = [v for m in modules for v in vars(importlib.import_module(m.name)).values() if isinstance(v, Format)]
+    return {form.name: form for form in sorted(found, key=lambda form: (form.order, form.name))}
+
+
+_FOLDER = importlib.import_module("crazyem.simulators.formats")
+FORMATS = discover(_FOLDER.__path__, _FOLDER.__name__)
+NAMES = (*(n for n in FORMATS if n != ROTORPY_JSON.name), OWN)
+
+
+def format_named(name: str) -> Format:
+    """A format by its name. Raises UsageError for an unknown one."""
+    if name not in FORMATS:
+        raise UsageError(f"unknown format '{name}' (known: {', '.join(NAMES)}).")
+    return FORMATS[name]
+
+
+def format_of(text: str, *, where: str) -> str:
+    """The name of a text's format, `OWN` for a vehicle file.
+
+    Raises: FileFormatError if no format fits.
+    """
+    for form in FORMATS.values():
+        if form.recognises(text):
+            return form.name
+    if "cmd_f_coef" in text or "rpy_coef" in text:
+        raise FileFormatError(
+            f"{where}: a fitted closed-loop model of crazyflow holds no physical constants; fit it to flights instead"
+        )
+    if "thrust2torque" in text and "mass_thrust" in text:
+        raise FileFormatError(f"{where}: gains of crazyflow's controller, not constants of a drone")
+    if any(line.split("=")[0].strip() == "mass" for line in text.splitlines()) and "inertia" in text:
+        return OWN
+    raise FileFormatError(f"{where}: no file of a known simulator ({', '.join(NAMES)})")
+
 
 # Quantities that a file holds or omits together: words for people, and the quantities.
 GROUPS: tuple[tuple[str, tuple[str, ...]], ...] = (

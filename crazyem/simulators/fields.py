@@ -11,9 +11,8 @@ from importlib import resources
 from typing import Any, Protocol
 
 from crazyem.errors import FileFormatError, UsageError
-from crazyem.simulators.constants import NUMBERS, SHORTEST_LAG, Constants, solved, value_of
+from crazyem.simulators.constants import NUMBERS, SHORTEST_LAG, Constants, impossible, objection, solved, value_of
 from crazyem.simulators.documents.spliced import Path, said
-from crazyem.simulators.plausible import impossible, objection
 
 AGREE = 0.01  # relative difference up to which two fields agree
 SAME = 1e-9  # relative difference up to which a number in a template stays unchanged

@@ -17,9 +17,8 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.rotors import THRUST_SCALE, TRIM
 from crazyem.physics.effects.timing import LAG_SD, MOTOR_LAG
 from crazyem.physics.motion import vehicle_values
-from crazyem.simulators.constants import NUMBERS, from_vehicle
+from crazyem.simulators.constants import NUMBERS, from_vehicle, impossible
 from crazyem.simulators.findings import rescaled
-from crazyem.simulators.plausible import impossible
 from crazyem.vehicle import Posterior, Vehicle
 
 Array = NDArray[np.float64]
