@@ -56,7 +56,7 @@ class StreamLink:
             self.rows.append((tuple(map(float, state)), (*map(float, 65535.0 * duty), 1e3 * VOLTAGE, float(FLYING))))
 
     def subscribe(self, variables: Sequence[str], rate_hz: float) -> Any:
-        from crazyem.links.base import Block, Variable
+        from crazyem.signals.sample import Block, Variable
 
         self.count += 1
         block = Block(self.count - 1, tuple(Variable(v, "float") for v in variables), round(1000 / rate_hz))
@@ -69,7 +69,7 @@ class StreamLink:
 
     def send(self, k: int) -> None:
         """Row `k` arrives now."""
-        from crazyem.links.base import Packet
+        from crazyem.signals.sample import Packet
 
         now = time.time()
         for block in (1, 0):  # motors first: a command is in force at its stamp
@@ -138,7 +138,7 @@ class Watched:
 
 def prefeed(link: StreamLink, watched: Watched) -> None:
     """Fill the window at once, with two updates instead of two hundred."""
-    from crazyem.links.base import Packet
+    from crazyem.signals.sample import Packet
 
     inner = getattr(watched.estimator, "inner", watched.estimator)
     every, inner.every = inner.every, PREFED // 2

@@ -31,26 +31,15 @@ def run(arguments: argparse.Namespace) -> int:
         from crazyem.commands.swarm import fly as fly_many
 
         return fly_many(arguments)
+    same = ("uri", "controller", "duration", "record", "append", "scenario", "seed", "speed", "rate", "reconnect",
+            "window", "every", "monitor", "false_alarms_per_hour")  # fmt: skip
     settings = FlightSettings(
-        uri=arguments.uri,
         vehicle=folding.load(arguments.vehicle),
-        controller=arguments.controller,
         trajectory=tuple(arguments.trajectory),
-        duration=arguments.duration,
         goal=arguments.goal / 100,
         push=not arguments.no_push,
         rules=write_rules(arguments),
-        record=arguments.record,
-        append=arguments.append,
-        scenario=arguments.scenario,
-        seed=arguments.seed,
-        speed=arguments.speed,
-        rate=arguments.rate,
-        reconnect=arguments.reconnect,
-        window=arguments.window,
-        every=arguments.every,
-        monitor=arguments.monitor,
-        false_alarms_per_hour=arguments.false_alarms_per_hour,
+        **{name: getattr(arguments, name) for name in same},
     )
     if arguments.trajectory != ["informative"]:
         trajectory_maker(arguments.trajectory, arguments.duration)  # raises here if invalid

@@ -75,7 +75,9 @@ def run(arguments: argparse.Namespace) -> int:
             session.history.notice(str(e))
         session.end_pushing(_outcome(session, error))
         session.close()
-        _note_hover_thrust(session)
+        if (supervisor := session.write_supervisor) is not None and (pusher := session.pusher) is not None:
+            target, before = supervisor.guard.controller, supervisor.originals
+            session.history.notice(hover_afterwards(target, now=pusher.known, before=before))
         title, extra = f"crazyem watch {arguments.uri}, vehicle {vehicle.name}", {"uri": arguments.uri}
         result, error = finished(session, title=title, log=arguments.record, extra=extra, error=error)
         try:
@@ -136,10 +138,3 @@ def _outcome(session: Session, error: BaseException | None) -> str:
     if error is not None:
         return "failed"
     return "interrupted" if session.telemetry.has(FLYING) else "landed"
-
-
-def _note_hover_thrust(session: Session) -> None:
-    supervisor, pusher = session.write_supervisor, session.pusher
-    if supervisor is not None and pusher is not None:
-        note = hover_afterwards(supervisor.guard.controller, now=pusher.known, before=supervisor.originals)
-        session.history.notice(note)

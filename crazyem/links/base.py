@@ -13,28 +13,7 @@ from typing import Protocol, runtime_checkable
 
 from crazyem.errors import LinkError
 from crazyem.links.clock import ClockFit
-from crazyem.signals.sample import Block, Packet, Variable
-
-__all__ = [
-    "AccountingLink",
-    "AnotherDroneError",
-    "Block",
-    "ClockedLink",
-    "ConfirmingLink",
-    "DescribingLink",
-    "HostClockLink",
-    "HoverThrustLink",
-    "Link",
-    "LinkLost",
-    "LinkStatistics",
-    "Outage",
-    "Packet",
-    "ParameterWrite",
-    "ReconnectingLink",
-    "StreamingLink",
-    "Variable",
-    "link_account",
-]
+from crazyem.signals.sample import Block, Packet
 
 
 class AnotherDroneError(LinkError):

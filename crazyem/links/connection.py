@@ -158,7 +158,10 @@ def _open(crazyflie: Any, progress: _Progress, uri: str, deadline: float, timeou
             now = time.monotonic()
             if now > deadline or now - progress.last_answer > min(SILENCE_LIMIT, timeout):
                 raise LinkError(_why(progress, uri, timeout, late=now > deadline))
-            _retry_if_due(crazyflie)
+            link = crazyflie.link
+            packet = link.due_retry() if isinstance(link, RetryTransport) else None
+            if packet is not None:
+                crazyflie.send_packet(packet)
         if not progress.done:
             raise LinkError(_why_failed(progress, uri))
         shorten_socket_timeout(crazyflie)
@@ -194,13 +197,6 @@ def new_driver(crazyflie: Any, uri: str) -> Any:
     statistics = crazyflie.link_statistics.radio_link_statistics_callback
     driver = cflib.crtp.get_link_driver(uri, statistics, crazyflie._link_error_cb)
     return RetryTransport(driver) if driver else None
-
-
-def _retry_if_due(crazyflie: Any) -> None:
-    link = crazyflie.link
-    packet = link.due_retry() if isinstance(link, RetryTransport) else None
-    if packet is not None:
-        crazyflie.send_packet(packet)
 
 
 def _why(progress: _Progress, uri: str, timeout: float, *, late: bool) -> str:

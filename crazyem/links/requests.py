@@ -304,7 +304,9 @@ class ParameterClient:
             # An echo with another value belongs to an earlier write: keep waiting for ours.
             if reply == payload:
                 self.fault = ""
-                self._remember(element, echoed)
+                group = self._cf.param.values.get(element.group)
+                if group is not None and echoed is not None:
+                    group[element.name] = str(echoed)  # cflib's own table of values (for its get_value)
                 return ParameterWrite(name, value, echoed, True, time.time())
         self.fault = (
             f"The drone at {self._uri} did not confirm {name} = {value:g} within {timeout:g} s."
@@ -327,12 +329,6 @@ class ParameterClient:
         if element is None:
             raise UsageError(f'The drone has no parameter "{name}".')
         return element
-
-    def _remember(self, element: Any, value: float | None) -> None:
-        """Update cflib's own table of values (for its get_value) after a write."""
-        group = self._cf.param.values.get(element.group)
-        if group is not None and value is not None:
-            group[element.name] = str(value)
 
 
 def _encode(name: str, element: Any, value: float) -> bytes:

@@ -26,7 +26,7 @@ class FirmwareClock:
         self._pairs: deque[tuple[float, float]] = deque()  # host s (monotonic), firmware s
         self._posts: deque[tuple[float, float]] = deque(maxlen=SEGMENTS + 1)
         self._lock = threading.Lock()
-        self._rate = 1.0
+        self.rate = 1.0  # firmware seconds per host second
         self._line = (0.0, 0.0)
         self._stale = False
         self._shown: tuple[float, float] | None = None  # host s, firmware s of the last answer
@@ -46,12 +46,6 @@ class FirmwareClock:
             self._measure_rate(host, firmware_time)
             self._stale = True  # the line is computed on demand only: packets are frequent
 
-    def _draw_line(self) -> None:
-        """Compute the line through the recent packet with the least delay, with the measured rate."""
-        newest = self._pairs[-1][0]
-        self._line = (newest, max(f - self._rate * (h - newest) for h, f in self._pairs))
-        self._stale = False
-
     def _measure_rate(self, host: float, firmware_time: float) -> None:
         """Median slope of the segments, robust against one stall; the overall slope while there are too few."""
         posts = self._posts
@@ -59,29 +53,26 @@ class FirmwareClock:
             posts.append((host, firmware_time))
             slopes = [(f2 - f1) / (h2 - h1) for (h1, f1), (h2, f2) in pairwise(posts)]
             if len(slopes) >= 3:
-                self._rate = max(statistics.median(slopes), 1e-3)
+                self.rate = max(statistics.median(slopes), 1e-3)
         if len(posts) < 4 and host - posts[0][0] > 0.05 and firmware_time > posts[0][1]:
-            self._rate = (firmware_time - posts[0][1]) / (host - posts[0][0])
-
-    @property
-    def rate(self) -> float:
-        """Firmware seconds per host second."""
-        return self._rate
+            self.rate = (firmware_time - posts[0][1]) / (host - posts[0][0])
 
     def now(self, host: float | None = None) -> float:
         """Firmware time [s] now; never runs backwards."""
         host = time.monotonic() if host is None else host
         with self._lock:
-            if self._stale:
-                self._draw_line()
+            if self._stale:  # the line through the recent packet with the least delay, with the measured rate
+                newest = self._pairs[-1][0]
+                self._line = (newest, max(f - self.rate * (h - newest) for h, f in self._pairs))
+                self._stale = False
             # Extrapolate for at most 1 s without a packet.
             ahead = min(host - self._line[0], 1.0)
-            value = self._line[1] + self._rate * ahead
+            value = self._line[1] + self.rate * ahead
             if self._shown is not None:
                 before, shown = self._shown
                 elapsed = max(host - before, 0.0)
-                if abs(value - shown - self._rate * elapsed) < LARGEST_CATCH_UP and host - self._line[0] <= 1.0:
-                    slowest, fastest = ((1.0 + s) * self._rate * elapsed for s in (-SLEW, SLEW))
+                if abs(value - shown - self.rate * elapsed) < LARGEST_CATCH_UP and host - self._line[0] <= 1.0:
+                    slowest, fastest = ((1.0 + s) * self.rate * elapsed for s in (-SLEW, SLEW))
                     value = shown + min(max(value - shown, slowest), fastest)
                 value = max(value, shown)
             self._shown = (max(host, self._shown[0]) if self._shown else host, value)

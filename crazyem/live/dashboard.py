@@ -343,7 +343,11 @@ class Dashboard:
             ) as live:  # fmt: skip
                 while not self._stop.is_set():
                     many = self._draw(live) >= MANY_DRONES
-                    self._wait(FRAME_PERIOD_OF_MANY if many else FRAME_PERIOD)
+                    period = FRAME_PERIOD_OF_MANY if many else FRAME_PERIOD  # or until a key is pressed
+                    if not self.keys.reading:
+                        self._stop.wait(period)
+                    elif key := self.keys.read(period):
+                        self.press(key)
         except Exception as error:  # a failed view must not end a flight
             self.failure = f"the live view ended: {error!r}."
         finally:
@@ -361,15 +365,6 @@ class Dashboard:
             refresh=True,
         )  # fmt: skip
         return len(snapshots)
-
-    def _wait(self, seconds: float) -> None:
-        """Wait until the next picture is due or a key is pressed."""
-        if not self.keys.reading:
-            self._stop.wait(seconds)
-            return
-        key = self.keys.read(seconds)
-        if key:
-            self.press(key)
 
     def press(self, key: str) -> None:
         """Carry out the action of a key."""

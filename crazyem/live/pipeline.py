@@ -6,7 +6,7 @@ order give the same estimates, live or in a replay.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 from crazyem.estimation.result import Estimate, Step
 from crazyem.live.flight_monitor import FlightMonitor
@@ -34,40 +34,11 @@ class Gate(Protocol):
     def on_mass_step(self, step: Step, time: float) -> None: ...
 
 
-@runtime_checkable
-class StepFinder(Protocol):
-    """An estimator that detects steps of mass."""
-
-    @property
-    def steps(self) -> Sequence[Step]: ...
-
-
-@runtime_checkable
-class EstimatorAround(Protocol):
-    """An estimator around another one."""
-
-    @property
-    def inner(self) -> Any: ...
-
-
-@runtime_checkable
-class ResidualSource(Protocol):
-    """An estimator that gives the innovations of its newest sample: time [s], values, standard deviations."""
-
-    @property
-    def residual(self) -> tuple[float, Any, Any] | None: ...
-
-
-def steps_of(estimator: object) -> Sequence[Step]:
+def steps_of(estimator: Any) -> Sequence[Step]:
     """The steps of mass that an estimator, or the one inside it, has detected; empty if it detects none."""
-    if isinstance(estimator, StepFinder):
-        return tuple(estimator.steps)
-    return steps_of(estimator.inner) if isinstance(estimator, EstimatorAround) else ()
-
-
-def residual_of(estimator: object) -> tuple[float, Any, Any] | None:
-    """Innovations of the newest sample, None if the estimator does not give them."""
-    return estimator.residual if isinstance(estimator, ResidualSource) else None
+    while hasattr(estimator, "inner") and not hasattr(estimator, "steps"):
+        estimator = estimator.inner
+    return tuple(getattr(estimator, "steps", ()))
 
 
 class Pipeline:

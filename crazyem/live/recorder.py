@@ -7,8 +7,8 @@ from typing import Any, Protocol, runtime_checkable
 
 from crazyem.control.trajectories import Reference
 from crazyem.estimation.result import Estimate
-from crazyem.links.base import Block, DescribingLink, Link, LinkStatistics, Packet, ParameterWrite
-from crazyem.live.history import History
+from crazyem.links.base import DescribingLink, Link, LinkStatistics, ParameterWrite
+from crazyem.signals.sample import Block, Packet
 from crazyem.vehicle import Vehicle
 
 
@@ -68,11 +68,3 @@ def open_recorder(
         },
         append=append,
     )
-
-
-def close_recorder(recorder: Recorder, statistics: LinkStatistics, history: History) -> None:
-    """Add the counts of packets to the recording and close it; adds a notice if the recording failed."""
-    counts = {n: getattr(statistics, n) for n in ("received", "lost", "late", "duplicates")}
-    recorder.metadata("statistics", {k: str(v) for k, v in counts.items()})
-    recorder.close()
-    history.notice(recorder.failure)

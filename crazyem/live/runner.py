@@ -19,7 +19,7 @@ from crazyem.live.flight_monitor import FlightMonitor
 from crazyem.live.flight_result import FlightResult, result_of
 from crazyem.live.pipeline import Estimator
 from crazyem.live.policy import FaultRules
-from crazyem.live.recorder import Recorder, close_recorder, open_recorder
+from crazyem.live.recorder import Recorder, open_recorder
 from crazyem.live.scheduler import Scheduler
 from crazyem.live.session import Session
 from crazyem.monitoring.fault import Fault
@@ -78,9 +78,12 @@ def finished(
     session: Session, *, title: str, log: str | None, extra: Mapping[str, Any], error: BaseException | None
 ) -> tuple[FlightResult | None, BaseException | None]:
     """Close the recording of a closed session; returns its result and the first error (`error`, or the result's)."""
-    statistics = session.link.statistics()
-    if session.recorder is not None:
-        close_recorder(session.recorder, statistics, session.history)
+    statistics, recorder = session.link.statistics(), session.recorder
+    if recorder is not None:
+        counts = ("received", "lost", "late", "duplicates")
+        recorder.metadata("statistics", {n: str(getattr(statistics, n)) for n in counts})
+        recorder.close()
+        session.history.notice(recorder.failure)
     try:
         result = result_of(
             session.pipeline, session.vehicle, title=title, log=log, received=statistics.received,

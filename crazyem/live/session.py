@@ -16,14 +16,12 @@ from crazyem.estimation.result import Estimate
 from crazyem.links.base import (
     AccountingLink,
     AnotherDroneError,
-    Block,
     ClockedLink,
     HostClockLink,
     HoverThrustLink,
     Link,
     LinkLost,
     Outage,
-    Packet,
     ReconnectingLink,
     StreamingLink,
     link_account,
@@ -33,7 +31,7 @@ from crazyem.live.flight_monitor import FlightMonitor, event_lines
 from crazyem.live.guard import Guard
 from crazyem.live.history import History
 from crazyem.live.hover_thrust import hover_rules, hover_target
-from crazyem.live.pipeline import Estimator, Pipeline, residual_of
+from crazyem.live.pipeline import Estimator, Pipeline
 from crazyem.live.policy import load_policy
 from crazyem.live.push import Pusher, nominal_estimates, push_target, read_originals
 from crazyem.live.recorder import FrameRecorder, Recorder
@@ -41,7 +39,7 @@ from crazyem.live.scheduler import Scheduler
 from crazyem.live.telemetry import Telemetry, WriteGate
 from crazyem.live.write_supervisor import WriteRules, WriteSupervisor
 from crazyem.monitoring.fault import Fault
-from crazyem.signals.sample import Sample
+from crazyem.signals.sample import Block, Packet, Sample
 from crazyem.signals.vocabulary import block_plan, decoders
 from crazyem.vehicle import Vehicle
 
@@ -176,7 +174,7 @@ class Session:
             history=self.history,
             gate=gate,
             now=lambda: self.clock.newest,
-            residual=lambda: residual_of(self.pipeline.estimator),
+            residual=lambda: getattr(self.pipeline.estimator, "residual", None),
             enabled=lambda time: self.pipeline.push_from <= time <= self.pipeline.push_until,
             record=self.record_event,
             fault=self.pipeline.fault_objection,
@@ -213,11 +211,6 @@ class Session:
         The receiving thread sets the end time between two packets and records it, so that a replay uses the same.
         """
         self._end_wanted = True
-
-    def _draw_end(self) -> None:
-        until = self.clock.newest  # of the packets before this one; later packets may still carry older stamps
-        self.pipeline.estimate_until = until
-        self.mark("estimate_end", until)
 
     def mark(self, name: str, time: float) -> None:
         """Add a mark at `time` [s] of the drone's clock to history and recording."""
@@ -275,7 +268,7 @@ class Session:
     def _estimated(self, estimate: Estimate) -> None:
         if self.recorder is not None:
             self.recorder.estimate(estimate)
-            residual = residual_of(self.pipeline.estimator)
+            residual = getattr(self.pipeline.estimator, "residual", None)
             if residual is not None:
                 self.recorder.residual(*residual)
         if self._on_estimate is not None:
@@ -393,7 +386,9 @@ class Session:
 
     def _packet(self, packet: Packet) -> None:
         if self._end_wanted and self.pipeline.estimate_until == math.inf and math.isfinite(self.clock.newest):
-            self._draw_end()
+            until = self.clock.newest  # of the packets before this one; later packets may still carry older stamps
+            self.pipeline.estimate_until = until
+            self.mark("estimate_end", until)
         self.clock.observe(packet.firmware_time_ms / 1000.0)
         names = self._names.get(packet.block)
         if names is None:

@@ -8,8 +8,9 @@ from types import SimpleNamespace
 
 from crazyem.errors import LinkError
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
-from crazyem.links.base import Block, LinkLost, LinkStatistics, Packet, ParameterWrite, Variable
+from crazyem.links.base import LinkLost, LinkStatistics, ParameterWrite
 from crazyem.live.telemetry import ARMED, AUTO_ARM, CAN_ARM, CAN_FLY, FLYING
+from crazyem.signals.sample import Block, Packet, Variable
 from crazyem.signals.vocabulary import (
     EXTRA_VARIABLES,
     MOTOR_BLOCK,
