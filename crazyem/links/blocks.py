@@ -160,16 +160,13 @@ class LogBlocks:
 
     # --- starting ---------------------------------------------------------------------------------------------------
 
-    def subscribe(
-        self, variables: Sequence[str], rate_hz: float, groups: Sequence[Sequence[str]] | None, lost: Callable[[], str]
-    ) -> tuple[Block, ...]:
+    def subscribe(self, variables: Sequence[str], rate_hz: float, lost: Callable[[], str]) -> tuple[Block, ...]:
         """See `CrazyflieLink.subscribe`; `lost()` gives the reason if the drone counts as lost, else ""."""
         in_use = [b for b in self._cf.log.log_blocks if b.added or b.pending or b.started]
         blocks = pack(
             variables,
             self.available(),
             period_of(rate_hz),
-            groups=groups,
             first_identifier=max(self._counters, default=-1) + 1,
             blocks_in_use=len(in_use),
             variables_in_use=sum(len(b.variables) for b in in_use),
@@ -187,12 +184,10 @@ class LogBlocks:
             except UsageError:
                 if block.period_ms <= PERIOD_UNIT_MS or not block.period_ms % PERIOD_UNIT_MS:
                     raise
-                return self._restart_in_tens(variables, block, groups, lost)
+                return self._restart_in_tens(variables, block, lost)
         return blocks
 
-    def _restart_in_tens(
-        self, variables: Sequence[str], block: Block, groups: Sequence[Sequence[str]] | None, lost: Callable[[], str]
-    ) -> tuple[Block, ...]:
+    def _restart_in_tens(self, variables: Sequence[str], block: Block, lost: Callable[[], str]) -> tuple[Block, ...]:
         """Subscribe again with a multiple of 10 ms, because older firmware refuses other periods."""
         _, config, receive = self._running.pop(block.identifier)
         config.data_received_cb.remove_callback(receive)
@@ -200,7 +195,7 @@ class LogBlocks:
         self._cf.log.log_blocks.remove(config)
         del self._counters[block.identifier]
         tens = max(1, round(block.period_ms / PERIOD_UNIT_MS)) * PERIOD_UNIT_MS
-        return self.subscribe(variables, 1000.0 / tens, groups, lost)
+        return self.subscribe(variables, 1000.0 / tens, lost)
 
     def _configuration(self, block: Block) -> Any:
         """cflib's object for the block, which numbers blocks and decodes packets."""

@@ -258,14 +258,9 @@ _RESEND_AFTER = 0.3  # s
 
 
 class ParameterClient:
-    """Verified parameter access for one connected cflib Crazyflie object.
-
-    Attributes:
-        fault: why the last access had no answer, one sentence; "" if parameters work.
-    """
+    """Verified parameter access for one connected cflib Crazyflie object."""
 
     def __init__(self, crazyflie: Any, uri: str) -> None:
-        self.fault = ""
         self._cf, self._uri = crazyflie, uri
         self._requests = RequestClient(crazyflie)
 
@@ -283,11 +278,9 @@ class ParameterClient:
         for reply in self._replies_to(_READ_CHANNEL, struct.pack("<H", element.ident), timeout):
             value = _decode(element.pytype, reply[3:])
             if reply[2] == 0 and value is not None:
-                self.fault = ""
                 return value
             raise LinkError(f"The drone refused to read the parameter {name} (error {reply[2]}).")
-        self.fault = f"The drone at {self._uri} did not answer a read of {name} within {timeout:g} s."
-        raise LinkError(self.fault)
+        raise LinkError(f"The drone at {self._uri} did not answer a read of {name} within {timeout:g} s.")
 
     def write(self, name: str, value: float, timeout: float) -> ParameterWrite:
         """Write a value and wait for its echo; without an echo the result is not verified.
@@ -303,16 +296,10 @@ class ParameterClient:
             echoed = _decode(element.pytype, reply[2:])
             # An echo with another value belongs to an earlier write: keep waiting for ours.
             if reply == payload:
-                self.fault = ""
                 group = self._cf.param.values.get(element.group)
                 if group is not None and echoed is not None:
                     group[element.name] = str(echoed)  # cflib's own table of values (for its get_value)
                 return ParameterWrite(name, value, echoed, True, time.time())
-        self.fault = (
-            f"The drone at {self._uri} did not confirm {name} = {value:g} within {timeout:g} s."
-            if echoed is None
-            else f"The drone at {self._uri} answered {name} = {value:g} with {echoed:g}."
-        )
         return ParameterWrite(name, value, echoed, False, time.time())
 
     def _replies_to(self, channel: int, payload: bytes, timeout: float) -> Iterator[bytes]:

@@ -140,16 +140,14 @@ class FakeLink:
         if not self.low_level:
             self.wanted, self._landing = (*self.wanted[:2], height), True
 
-    def go_to(self, *a, **k):
-        raise AssertionError
-
     def send_full_state(self, position, velocity, acceleration, quaternion, body_rate):
         self.calls.append("setpoint")
         if self.lost_at is not None and self.fm > self.lost_at:
             raise LinkError("gone")
         self.low_level, self.wanted, self.last_setpoint = True, tuple(position), self.fm
 
-    send_position = send_hover = go_to
+    def send_position(self, *a, **k):
+        raise AssertionError
 
     def release_setpoints(self):
         self.calls.append("release")

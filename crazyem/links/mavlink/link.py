@@ -262,11 +262,6 @@ class MavlinkLink:
         return self._parameters.types()
 
     @property
-    def parameter_fault(self) -> str:
-        """Why the last parameter access had no answer; "" if parameters work."""
-        return self._parameters.fault
-
-    @property
     def hover_parameter(self) -> str:
         """The hover thrust parameter of this kind of autopilot, "" if none is known."""
         return HOVER_PARAMETERS.get(self.autopilot, "")
@@ -313,9 +308,7 @@ class MavlinkLink:
     def _not_flown(self, *_: object, **__: object) -> None:
         raise UsageError("a MAVLink drone is watched, not flown: fly it with its own ground station.")
 
-    arm = take_off = land = go_to = _not_flown
-    send_full_state = send_position = send_hover = _not_flown
-    release_setpoints = stop = _not_flown
+    arm = take_off = land = send_full_state = send_position = release_setpoints = stop = _not_flown
 
 
 def _missing(seen: Mapping[str, int]) -> list[str]:
