@@ -13,8 +13,8 @@ from crazyem.errors import CrazyemError, UsageError
 from crazyem.estimation.steps import estimator_for
 from crazyem.live.controllers import controller_named
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
-from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.flight_result import FlightResult
+from crazyem.live.pipeline import monitor_for
 from crazyem.live.policy import Policy, load_policy
 from crazyem.live.recorder import Recorder
 from crazyem.live.runner import connect, finished, open_session, warm_up

@@ -6,9 +6,8 @@ import time
 from pathlib import Path
 
 from crazyem.atomic_file import write_file
-from crazyem.commands.common import names_in
 from crazyem.commands.files import read_options
-from crazyem.commands.output import deliver
+from crazyem.commands.output import deliver, names_in
 from crazyem.live.flight_result import check_writable
 
 

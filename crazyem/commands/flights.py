@@ -17,7 +17,7 @@ from dataclasses import replace
 from typing import Any
 
 from crazyem.api.flying import write_rules_for
-from crazyem.commands.common import LiveLine, say
+from crazyem.commands.output import LiveLine, say
 from crazyem.errors import UsageError
 from crazyem.extras import installed, require
 from crazyem.live.flight import Interrupts

@@ -5,7 +5,6 @@ import contextlib
 from collections.abc import Iterator
 
 from crazyem.api.flying import FlightObserver, FlightSettings, Progress, observed_flight
-from crazyem.commands.common import LiveLine, plot_path, report, say
 from crazyem.commands.flights import (
     Stream,
     SwarmInterrupts,
@@ -16,6 +15,7 @@ from crazyem.commands.flights import (
     wants_view,
     write_rules,
 )
+from crazyem.commands.output import LiveLine, plot_path, report, say
 from crazyem.control.named_trajectories import duration_note, trajectory_maker
 from crazyem.errors import CrazyemError
 from crazyem.live.flight import FlightInterruptedError, Interrupts, MotorsCutError

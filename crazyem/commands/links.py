@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 from crazyem.commands.output import put
@@ -48,7 +49,7 @@ def drones(interfaces: Sequence[Interface]) -> list[str]:
 
 def summary(interfaces: Sequence[Interface]) -> dict[str, Any]:
     """The result for programs."""
-    return {"interfaces": [i.to_json() for i in interfaces], "drones": drones(interfaces)}
+    return {"interfaces": [asdict(i) for i in interfaces], "drones": drones(interfaces)}
 
 
 def text(interfaces: Sequence[Interface]) -> str:

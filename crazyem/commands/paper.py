@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from crazyem.commands.batch import each, processes
-from crazyem.commands.common import say
-from crazyem.commands.output import Result, put
+from crazyem.commands.output import Result, put, say
 from crazyem.errors import UsageError
 from crazyem.paper.settings import READINGS, Settings, describe_text, settings_with
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from crazyem.commands.common import LiveLine, compile_kernels, new_estimator, say
 from crazyem.commands.flights import (
     Stream,
     SwarmInterrupts,
@@ -27,7 +26,7 @@ from crazyem.commands.flights import (
     wants_view,
     write_rules,
 )
-from crazyem.commands.output import put
+from crazyem.commands.output import LiveLine, compile_kernels, new_estimator, put, say
 from crazyem.control.named_trajectories import DEFAULT_HEIGHT, duration_note, trajectory_maker
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links.base import Link

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from crazyem.atomic_file import write_file
-from crazyem.commands.common import names_in, say
 from crazyem.commands.files import read_options
-from crazyem.commands.output import deliver
+from crazyem.commands.output import deliver, names_in, say
 from crazyem.errors import DataError, UsageError
 from crazyem.live.flight_result import check_writable
 

@@ -8,7 +8,6 @@ import argparse
 import contextlib
 import math
 
-from crazyem.commands.common import LiveLine, compile_kernels, new_estimator, plot_path, report, say
 from crazyem.commands.flights import (
     Stream,
     Viewed,
@@ -19,12 +18,13 @@ from crazyem.commands.flights import (
     live_view,
     wants_view,
 )
+from crazyem.commands.output import LiveLine, compile_kernels, new_estimator, plot_path, report, say
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
 from crazyem.links.base import Link
-from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.flight_result import check_writable
 from crazyem.live.hover_thrust import hover_afterwards
+from crazyem.live.pipeline import monitor_for
 from crazyem.live.policy import Policy, load_policy
 from crazyem.live.runner import connect, finished, open_session
 from crazyem.live.session import Session

@@ -10,9 +10,9 @@ from crazyem.control.indi import PARAMETERS, IndiGains
 from crazyem.control.trajectories import Trajectory, Vector, after_hover
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links.base import ConfirmingLink, HostClockLink, Link
+from crazyem.live.clock import SetpointStream
 from crazyem.live.controllers import Controller
 from crazyem.live.session import Session
-from crazyem.live.stream import SetpointStream
 from crazyem.live.telemetry import ARMED, CAN_FLY, FLYING
 from crazyem.live.write_supervisor import WriteRules
 

@@ -1,7 +1,7 @@
 """A running estimation over an open link: packets become samples, go through the pipeline, and are recorded.
 
 Threads: one receives (records, updates clock and telemetry; it is fast, so telemetry is always fresh), one estimates,
-one writes parameters. Setpoints have their own thread (stream.py). No thread waits for another. In a process with many
+one writes parameters. Setpoints have their own thread (clock.py). No thread waits for another. In a process with many
 sessions, a scheduler receives and estimates for all of them (scheduler.py).
 """
 
@@ -27,11 +27,10 @@ from crazyem.links.base import (
     link_account,
 )
 from crazyem.live.clock import FirmwareClock
-from crazyem.live.flight_monitor import FlightMonitor, event_lines
 from crazyem.live.guard import Guard
 from crazyem.live.history import History
 from crazyem.live.hover_thrust import hover_rules, hover_target
-from crazyem.live.pipeline import Estimator, Pipeline
+from crazyem.live.pipeline import Estimator, FlightMonitor, Pipeline, event_lines
 from crazyem.live.policy import load_policy
 from crazyem.live.push import Pusher, nominal_estimates, push_target, read_originals
 from crazyem.live.recorder import FrameRecorder, Recorder

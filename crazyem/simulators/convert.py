@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from crazyem.errors import FileFormatError, UsageError
+from crazyem.notebook import finite
 from crazyem.physics import folding
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.supply import THRUST_CURVE
 from crazyem.recordings.recording import Recording
 from crazyem.simulators.constants import Constants, from_vehicle, impossible, objection, to_vehicle, without_effects
-from crazyem.simulators.cost import HORIZON, errors_after, flown, reference_flight, rms_distance, said, to_json
+from crazyem.simulators.cost import HORIZON, errors_after, flown, reference_flight, rms_distance, said
 from crazyem.simulators.fields import Contradiction, Format, SimulatorFile, read, write
 from crazyem.simulators.formats.rotorpy import ROTORPY, ROTORPY_JSON
 from crazyem.vehicle import Vehicle, preset_names
@@ -118,9 +119,9 @@ class Omission:
     def to_json(self) -> dict[str, Any]:
         """For programs."""
         found: dict[str, Any] = {"name": self.name, "words": self.words, "why": self.why, "horizon_s": HORIZON}
-        found["cost"] = None if self.cost is None else to_json(self.cost)
+        found["cost"] = finite(self.cost)  # None where a model left the range of numbers
         if self.errors is not None:
-            found["errors"] = {k: to_json(v) for k, v in self.errors.items()}
+            found["errors"] = finite(self.errors)
         return found
 
 

@@ -7,7 +7,6 @@ Without a recording the reference flight is synthetic: a hundred starts of brisk
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,8 +91,3 @@ def errors_after(recording: Recording, vehicles: Mapping[str, Vehicle]) -> dict[
 def said(errors: Mapping[str, float]) -> str:
     """Distances for people."""
     return ", ".join(f"{errors[q] if abs(errors[q]) > NOTHING else 0.0:.2g} {unit}" for q, unit in UNITS.items())
-
-
-def to_json(errors: Mapping[str, float]) -> dict[str, Any]:
-    """Distances for programs; None where a model left the range of numbers."""
-    return {q: (v if math.isfinite(v) else None) for q, v in errors.items()}

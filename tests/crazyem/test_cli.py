@@ -10,7 +10,7 @@ from mavlink_pilot import free_port
 from recording_files import fails
 
 from crazyem.cli import main, parser
-from crazyem.commands.common import compile_kernels
+from crazyem.commands.output import compile_kernels
 from crazyem.control.named_trajectories import trajectory_maker
 from crazyem.errors import UsageError
 from crazyem.live import runner
@@ -160,7 +160,7 @@ def test_whole_periods_are_told_in_one_line():
 def test_a_plot_is_written_only_beside_a_file_that_was_asked_for():
     from argparse import Namespace
 
-    from crazyem.commands.common import plot_path
+    from crazyem.commands.output import plot_path
 
     assert plot_path(Namespace(plot=None), None, None) is None
     assert plot_path(Namespace(plot=None), None, "-") is None
