@@ -2,7 +2,6 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from crazyem.atomic_file import write_file
 from crazyem.commands.files import read_options
@@ -39,7 +38,7 @@ def _check(arguments: argparse.Namespace) -> int:
     )
     if arguments.write:
         write_file(arguments.write, found.corrected.text)
-    _report(arguments, {**found.to_dict(), "written": arguments.write}, [str(found)])
+    deliver({**found.to_dict(), "written": arguments.write}, arguments.json, str(found))
     return DataError.exit_code if arguments.strict and not found.fits else 0
 
 
@@ -70,7 +69,8 @@ def _convert(arguments: argparse.Namespace) -> int:
     lines += [f"  {remark}" for remark in remarks]
     if made.omissions:
         lines += ["  not held by this file:", *(f"    {omission}" for omission in made.omissions)]
-    return _report(arguments, document, lines)
+    deliver(document, arguments.json, "\n".join(lines))
+    return 0
 
 
 def _sample(arguments: argparse.Namespace) -> int:
@@ -110,7 +110,8 @@ def _sample(arguments: argparse.Namespace) -> int:
     }  # fmt: skip
     lines = [f"{output}: {arguments.count} drones of {vehicle.name}, seed {arguments.seed}"]
     lines += [f"  {n}: {mean:.4g} +- {sd:.2g}" for n, (mean, sd) in rows.items() if sd > 0.0]
-    return _report(arguments, document, lines)
+    deliver(document, arguments.json, "\n".join(lines))
+    return 0
 
 
 def _several(source: str, form: str | None) -> list[str]:
@@ -143,8 +144,3 @@ def _check_target(output: Path, arguments: argparse.Namespace) -> None:
     check_writable(str(output))
     if arguments.json not in (None, "-"):
         check_writable(arguments.json)
-
-
-def _report(arguments: argparse.Namespace, document: dict[str, Any], lines: list[str]) -> int:
-    deliver(document, arguments.json, "\n".join(lines))
-    return 0

@@ -199,7 +199,12 @@ class LogBlocks:
 
     def _configuration(self, block: Block) -> Any:
         """cflib's object for the block, which numbers blocks and decodes packets."""
-        config = _new_configuration(f"crazyem {block.identifier}", max(block.period_ms, 10))
+        from cflib.crazyflie.log import LogConfig
+
+        class Configuration(LogConfig):  # always counts as added; else cflib would start it before it is complete
+            added = property(lambda self: True, lambda self, value: None)
+
+        config = Configuration(f"crazyem {block.identifier}", max(block.period_ms, 10))
         for variable in block.variables:
             config.add_variable(variable.name)
         try:
@@ -364,16 +369,6 @@ class LogBlocks:
     def newest_ms(self) -> float:
         """Newest unwrapped stamp, ms; -inf before the first."""
         return self._newest
-
-
-def _new_configuration(name: str, period_ms: int) -> Any:
-    """A LogConfig that always counts as added; else cflib would start the block at a reply, before it is complete."""
-    from cflib.crazyflie.log import LogConfig
-
-    class Configuration(LogConfig):
-        added = property(lambda self: True, lambda self, value: None)
-
-    return Configuration(name, period_ms)
 
 
 def _median_and_p99(values: list[float]) -> tuple[float, float]:

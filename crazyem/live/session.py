@@ -396,7 +396,10 @@ class Session:
             self.recorder.packet(packet)
             if packet.host_time - self._link_recorded >= LINK_RECORD_PERIOD:
                 self._link_recorded = packet.host_time
-                self._record_link(packet)
+                fit = self.link.clock() if isinstance(self.link, ClockedLink) else None
+                # latency against the fastest packets
+                late = math.nan if fit is None else packet.host_time - fit.to_host(packet.firmware_time_ms)
+                self.recorder.link(self.link.statistics(), late)
         if "supervisor.info" in names:
             info = packet.values[names.index("supervisor.info")]
             self.telemetry.info = int(info) if math.isfinite(info) else None
@@ -415,13 +418,6 @@ class Session:
         if self.write_supervisor is not None:
             self.write_supervisor.take(samples)
         (self._samples if self._mailbox is None else self._mailbox).put(samples)
-
-    def _record_link(self, packet: Packet) -> None:
-        """Record the link's statistics, and the latency against the fastest packets if the link has a clock fit."""
-        assert self.recorder is not None
-        fit = self.link.clock() if isinstance(self.link, ClockedLink) else None
-        late = math.nan if fit is None else packet.host_time - fit.to_host(packet.firmware_time_ms)
-        self.recorder.link(self.link.statistics(), late)
 
     def _estimate(self) -> None:
         try:

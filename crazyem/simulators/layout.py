@@ -25,7 +25,8 @@ def read_positions(positions: Array, *, where: str, field: str) -> tuple[dict[st
     around = positions - middle
     remarks = []
     if is_plus(positions):
-        around, remarks = _turned(around), [PLUS]
+        s = math.sqrt(0.5)
+        around, remarks = around @ np.array([[s, -s, 0.0], [s, s, 0.0], [0.0, 0.0, 1.0]]).T, [PLUS]
     arms = np.abs(around[:, :2])
     arm = arms.mean(axis=0)
     quadrants = {(bool(x > 0), bool(y > 0)) for x, y in around[:, :2]}
@@ -54,9 +55,3 @@ def is_plus(positions: Array) -> bool:
     """Whether rotors lie on the body axes."""
     around = np.abs((positions - positions.mean(axis=0))[:, :2])
     return bool((around.min(axis=1) < 0.1 * around.max(axis=1)).all())
-
-
-def _turned(around: Array) -> Array:
-    s = math.sqrt(0.5)
-    turned: Array = around @ np.array([[s, -s, 0.0], [s, s, 0.0], [0.0, 0.0, 1.0]]).T
-    return turned
