@@ -81,7 +81,7 @@ class Watched:
 
     def __init__(self, link: Any, *, number: int, of: int, scheduler: Any, folder: str | None, window: int) -> None:
         from crazyem.estimation.online import OnlineEstimator
-        from crazyem.live.recorder import open_recorder
+        from crazyem.live.history import open_recorder
         from crazyem.live.scheduler import UpdateThrottle
         from crazyem.live.session import Session
         from crazyem.vehicle import load_vehicle

@@ -21,9 +21,9 @@ from crazyem.commands.output import LiveLine, say
 from crazyem.errors import UsageError
 from crazyem.extras import installed, require
 from crazyem.live.flight import Interrupts
-from crazyem.live.recorder import Recorder
+from crazyem.live.history import Recorder
+from crazyem.live.policy import WriteRules
 from crazyem.live.session import Session
-from crazyem.live.write_supervisor import WriteRules
 
 
 @contextlib.contextmanager

@@ -20,7 +20,7 @@ from crazyem.control.named_trajectories import duration_note, trajectory_maker
 from crazyem.errors import CrazyemError
 from crazyem.live.flight import FlightInterruptedError, Interrupts, MotorsCutError
 from crazyem.live.flight_result import check_writable
-from crazyem.live.recorder import Recorder
+from crazyem.live.history import Recorder
 from crazyem.live.session import Session
 from crazyem.physics import folding
 

@@ -8,9 +8,8 @@ from typing import Protocol
 from crazyem.errors import DataError
 from crazyem.estimation.result import Estimate
 from crazyem.live.pipeline import monitor_for
-from crazyem.live.policy import Policy, load_policy
+from crazyem.live.policy import Policy, WriteRules, load_policy
 from crazyem.live.session import Session
-from crazyem.live.write_supervisor import WriteRules
 from crazyem.monitoring.fault import Fault
 from crazyem.physics import folding
 from crazyem.vehicle import Vehicle

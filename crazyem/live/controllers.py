@@ -126,7 +126,7 @@ class Controller:
     note: str = ""
     known: tuple[tuple[str, float], ...] = ()
     incremental: bool = False
-    mass_scale: float = 1.0  # kg per unit of the mass parameter, if it is not a mass (see crazyem.live.hover_thrust)
+    mass_scale: float = 1.0  # kg per unit of the mass parameter, if it is not a mass (see crazyem.live.push)
     persistent: bool = False  # whether parameters outlive a restart of the firmware
 
     @property

@@ -12,9 +12,9 @@ from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links.base import ConfirmingLink, HostClockLink, Link
 from crazyem.live.clock import SetpointStream
 from crazyem.live.controllers import Controller
+from crazyem.live.policy import WriteRules
 from crazyem.live.session import Session
 from crazyem.live.telemetry import ARMED, CAN_FLY, FLYING
-from crazyem.live.write_supervisor import WriteRules
 
 BASELINE_SECONDS = 3.0  # s of hover before the first push: shows the behaviour with the present parameters
 CONFIRMED_WITHIN = 0.25  # s to confirm the plan to land; without setpoints the drone levels out after 0.5 s

@@ -12,7 +12,7 @@ from typing import Any
 
 from crazyem.errors import UsageError
 from crazyem.extras import require
-from crazyem.live.recorder import Recorder
+from crazyem.live.history import Recorder
 from crazyem.recordings.mcap.writer import RecordingWriter
 
 FOXGLOVE_PORT = 8765  # default port of viewers

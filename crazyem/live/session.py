@@ -28,15 +28,13 @@ from crazyem.links.base import (
 )
 from crazyem.live.clock import FirmwareClock
 from crazyem.live.guard import Guard
-from crazyem.live.history import History
-from crazyem.live.hover_thrust import hover_rules, hover_target
+from crazyem.live.history import FrameRecorder, History, Recorder
 from crazyem.live.pipeline import Estimator, FlightMonitor, Pipeline, event_lines
-from crazyem.live.policy import load_policy
-from crazyem.live.push import Pusher, nominal_estimates, push_target, read_originals
-from crazyem.live.recorder import FrameRecorder, Recorder
+from crazyem.live.policy import WriteRules, load_policy
+from crazyem.live.push import Pusher, hover_rules, hover_target, nominal_estimates, push_target, read_originals
 from crazyem.live.scheduler import Scheduler
 from crazyem.live.telemetry import Telemetry, WriteGate
-from crazyem.live.write_supervisor import WriteRules, WriteSupervisor
+from crazyem.live.write_supervisor import WriteSupervisor
 from crazyem.monitoring.fault import Fault
 from crazyem.signals.sample import Block, Packet, Sample
 from crazyem.signals.vocabulary import block_plan, decoders
