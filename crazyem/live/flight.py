@@ -227,7 +227,8 @@ class Flight:
             self._hand_over(duration)
             self._sleep(duration)
             try:
-                self._wait(self._landed, 5.0, "did not land")
+                self._wait(lambda: not self.telemetry.has(FLYING) and not self.telemetry.height > self._ground + 0.15,
+                           5.0, "did not land")  # fmt: skip
                 break
             except LinkError:
                 raise
@@ -264,9 +265,6 @@ class Flight:
             link.land(self._ground, duration)
             self._sleep(HAND_OVER_EVERY)
             link.release_setpoints()
-
-    def _landed(self) -> bool:
-        return not self.telemetry.has(FLYING) and not self.telemetry.height > self._ground + 0.15
 
     # ways out
 

@@ -137,10 +137,6 @@ class Scheduler:
             thread.start()
         self.poller = PacketPoller()
 
-    def mailbox(self, work: Callable[[Any], None], failed: Callable[[Exception], None]) -> Mailbox:
-        """A new mailbox; see `Mailbox`."""
-        return Mailbox(self, work, failed)
-
     def enqueue(self, mailbox: Mailbox) -> None:
         """Queue a mailbox for a worker (called by mailboxes)."""
         self._ready.put(mailbox)

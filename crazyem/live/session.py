@@ -32,7 +32,7 @@ from crazyem.live.history import FrameRecorder, History, Recorder
 from crazyem.live.pipeline import Estimator, FlightMonitor, Pipeline, event_lines
 from crazyem.live.policy import WriteRules, load_policy
 from crazyem.live.push import Pusher, hover_rules, hover_target, nominal_estimates, push_target, read_originals
-from crazyem.live.scheduler import Scheduler
+from crazyem.live.scheduler import Mailbox, Scheduler
 from crazyem.live.telemetry import Telemetry, WriteGate
 from crazyem.live.write_supervisor import WriteSupervisor
 from crazyem.monitoring.fault import Fault
@@ -103,7 +103,7 @@ class Session:
         self.blocks: tuple[Block, ...] = ()
         self._samples: queue.SimpleQueue[list[Sample] | None] = queue.SimpleQueue()
         self._scheduler = scheduler
-        self._mailbox = scheduler.mailbox(self._feed, self._estimating_failed) if scheduler is not None else None
+        self._mailbox = Mailbox(scheduler, self._feed, self._estimating_failed) if scheduler is not None else None
         self._receiving_ended = False  # nothing is received any more
         self._reconnection: threading.Thread | None = None  # with a scheduler only: its thread must not wait
         self._link_recorded = -math.inf
