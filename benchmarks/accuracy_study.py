@@ -151,15 +151,13 @@ _Said = tuple[Flight, int, int, NDArray, NDArray, NDArray, bool, int, float]
 
 def _offline(part: Part, settings: Settings, sensor: str, seed: int) -> Iterator[_Said]:
     flight = fly(settings, seed)
-    factors = part.start or (1.0, 1.0, 1.0, 1.0)
-    start: dict[str, Any] = {}
     if part.start is not None:
-        start["mass"] = settings.mass * factors[0]
-        start["inertia"] = tuple(i * f for i, f in zip(settings.inertia, factors[1:]))
+        mass, *inertia = (v * f for v, f in zip((settings.mass, *settings.inertia), part.start))
+        flight.settings = replace(settings, mass_start=mass, inertia_start=tuple(inertia))
     for first, last in stretches(settings, part.span):
         fit = product_offline(
             flight, sensor, first, last, known=known_noise(settings) if part.known else None,
-            accelerometer=part.accelerometer, **start,
+            accelerometer=part.accelerometer,
         )  # fmt: skip
         yield flight, first, last, fit.value, fit.sd, fit.ci95, fit.converged, fit.passes, fit.seconds
 

@@ -30,10 +30,11 @@ import numpy as np
 from crazyem.control.trajectories import Trajectory, excite, hover
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.estimation.steps import StepAwareEstimator
-from crazyem.links.base import Block, LinkLost, LinkStatistics, Packet, ParameterWrite, Variable
+from crazyem.links.base import LinkLost, LinkStatistics, ParameterWrite
 from crazyem.live.attach import Attachment
+from crazyem.live.runner import warm_up
 from crazyem.live.session import Session
-from crazyem.live.warm_up import warm_up
+from crazyem.signals.sample import Block, Packet, Variable
 from crazyem.vehicle import load_vehicle
 from firmware_sim.commander import setpoint as sp
 from firmware_sim.commander.setpoint import CRTP

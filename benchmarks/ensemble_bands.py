@@ -22,8 +22,7 @@ from crazyem.diagnosis.prediction.horizon import UNITS, errors, open_loop, windo
 from crazyem.diagnosis.prediction.predict import Recorded, recorded
 from crazyem.physics.rotors import wrench
 from crazyem.recordings import open_recording
-from crazyem.simulators.convert import convert, load_source
-from crazyem.simulators.cost import HORIZON
+from crazyem.simulators.convert import HORIZON, convert, load_source
 from crazyem.simulators.findings import field_findings, rescaled
 from crazyem.simulators.sampling import sample
 from crazyem.vehicle import Posterior, Vehicle, load_vehicle

@@ -23,18 +23,16 @@ from crazyem.estimation.online import OnlineEstimator
 from crazyem.estimation.result import Estimate
 from crazyem.estimation.steps import StepAwareEstimator
 from crazyem.links import open_link
-from crazyem.links.base import Packet
 from crazyem.live.controllers import LEE, writes_for
 from crazyem.live.flight import Flight, FlightPlan
-from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.guard import INERTIA_NAMES, Decision
-from crazyem.live.policy import FaultRules
-from crazyem.live.recorder import open_recorder
+from crazyem.live.history import open_recorder
+from crazyem.live.pipeline import monitor_for
+from crazyem.live.policy import FaultRules, WriteRules
+from crazyem.live.runner import warm_up
 from crazyem.live.session import Session
-from crazyem.live.warm_up import warm_up
-from crazyem.live.write_supervisor import WriteRules
 from crazyem.recordings import open_recording
-from crazyem.signals.sample import Sample
+from crazyem.signals.sample import Packet, Sample
 from crazyem.vehicle import Vehicle, load_vehicle
 from firmware_sim.relay.faults import UP, Engine, Fault
 from firmware_sim.relay.relay import Relay

@@ -13,7 +13,7 @@ from firmware_sim.flight import Flight as SimulatedFlight
 from firmware_sim.scenario import load_scenario
 from firmware_sim.server import Server, bind
 
-# A gate for writes without a guard: every write passes (see crazyem.live.write_gate).
+# A gate for writes without a guard: every write passes (see crazyem.live.telemetry).
 OPEN_GATE: Any = SimpleNamespace(stale=lambda: "", misplaced=lambda purpose: "")
 
 

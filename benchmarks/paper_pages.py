@@ -18,18 +18,19 @@ import numpy as np
 from crazyem.atomic_file import write_file
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.paper.experiments import Task
-from crazyem.paper.pages import notes, settings_grid
-from crazyem.paper.published_values import ONLINE_ITERATIONS
-from crazyem.paper.runner import SCHEMA
-from crazyem.paper.table_text import (
+from crazyem.paper.pages import (
     Grid,
     convergence_grid,
     errors_grid,
+    notes,
     number,
     percent,
+    settings_grid,
     table1_grid,
     table_grid,
 )  # fmt: skip
+from crazyem.paper.published_values import ONLINE_ITERATIONS
+from crazyem.paper.runner import SCHEMA
 
 Record = Mapping[str, Any]
 STORED_RESULTS = "explanation/paper_results.json"

@@ -33,14 +33,12 @@ from crazyem.links import open_link
 from crazyem.links.base import ParameterWrite
 from crazyem.live.controllers import LEE
 from crazyem.live.flight import Flight, FlightPlan
-from crazyem.live.history import History
-from crazyem.live.policy import load_policy
+from crazyem.live.history import History, open_recorder
+from crazyem.live.policy import WriteRules, load_policy
 from crazyem.live.push import Pusher
-from crazyem.live.recorder import open_recorder
+from crazyem.live.runner import warm_up
 from crazyem.live.session import Session
 from crazyem.live.simulator import Simulator
-from crazyem.live.warm_up import warm_up
-from crazyem.live.write_supervisor import WriteRules
 from crazyem.recordings import open_recording
 from crazyem.vehicle import load_vehicle
 

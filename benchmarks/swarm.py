@@ -56,7 +56,7 @@ class StreamLink:
             self.rows.append((tuple(map(float, state)), (*map(float, 65535.0 * duty), 1e3 * VOLTAGE, float(FLYING))))
 
     def subscribe(self, variables: Sequence[str], rate_hz: float) -> Any:
-        from crazyem.links.base import Block, Variable
+        from crazyem.signals.sample import Block, Variable
 
         self.count += 1
         block = Block(self.count - 1, tuple(Variable(v, "float") for v in variables), round(1000 / rate_hz))
@@ -69,7 +69,7 @@ class StreamLink:
 
     def send(self, k: int) -> None:
         """Row `k` arrives now."""
-        from crazyem.links.base import Packet
+        from crazyem.signals.sample import Packet
 
         now = time.time()
         for block in (1, 0):  # motors first: a command is in force at its stamp
@@ -81,7 +81,7 @@ class Watched:
 
     def __init__(self, link: Any, *, number: int, of: int, scheduler: Any, folder: str | None, window: int) -> None:
         from crazyem.estimation.online import OnlineEstimator
-        from crazyem.live.recorder import open_recorder
+        from crazyem.live.history import open_recorder
         from crazyem.live.scheduler import UpdateThrottle
         from crazyem.live.session import Session
         from crazyem.vehicle import load_vehicle
@@ -138,7 +138,7 @@ class Watched:
 
 def prefeed(link: StreamLink, watched: Watched) -> None:
     """Fill the window at once, with two updates instead of two hundred."""
-    from crazyem.links.base import Packet
+    from crazyem.signals.sample import Packet
 
     inner = getattr(watched.estimator, "inner", watched.estimator)
     every, inner.every = inner.every, PREFED // 2
@@ -152,9 +152,9 @@ def prefeed(link: StreamLink, watched: Watched) -> None:
 
 def run_streams(count: int, *, seconds: float, workers: int | None, record: bool, window: int, cold: bool) -> Any:
     """Measure one number of drones; returns raw numbers."""
+    from crazyem.live.runner import warm_up
     from crazyem.live.scheduler import Scheduler
     from crazyem.live.swarm import shorten_switch_interval
-    from crazyem.live.warm_up import warm_up
     from crazyem.vehicle import load_vehicle
 
     warm_up(load_vehicle("cf2"))
@@ -216,9 +216,9 @@ def _twin(link: StreamLink, number: int) -> StreamLink:
 def run_simulator(count: int, *, seconds: float, workers: int | None, record: bool, window: int) -> Any:
     """The same over UDP and cflib: the swarm simulator runs on the same cores, each drone hovers."""
     from crazyem.links import open_link
+    from crazyem.live.runner import warm_up
     from crazyem.live.scheduler import Scheduler
     from crazyem.live.swarm import shorten_switch_interval
-    from crazyem.live.warm_up import warm_up
     from crazyem.vehicle import load_vehicle
 
     warm_up(load_vehicle("cf2"))

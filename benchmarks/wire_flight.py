@@ -26,7 +26,7 @@ from firmware_sim.scenario import Scenario
 HEIGHT = 1.0  # m
 BASELINE = 2.0  # s of hover before the trajectory, as `crazyem fly` has it
 # Setpoints as `crazyem fly` sends them, with the jitter seen in its recordings (a tenth 0.9 ms late, a tenth early). At
-# the rate of the log their steps would keep their place between two log samples (crazyem/live/stream.py).
+# the rate of the log their steps would keep their place between two log samples (crazyem/live/clock.py).
 SETPOINT_PERIOD, SETPOINT_JITTER = 7.0, 0.8  # ms
 LOG_PERIOD = round(1000.0 / LOG_RATE)  # ms
 LEE = 5  # stabilizer.controller

@@ -30,7 +30,7 @@ if any(sum(k.stats.cache_hits.values()) for k in compiled._KERNELS if hasattr(k,
 """
 
 ESTIMATOR = """
-from crazyem.live.warm_up import warm_up
+from crazyem.live.runner import warm_up
 from crazyem.vehicle import load_vehicle
 warm_up(load_vehicle("cf2"))
 """

@@ -25,7 +25,7 @@ from crazyem.links import open_link
 from crazyem.live.clock import FirmwareClock
 from crazyem.live.controllers import controller_named
 from crazyem.live.flight import Flight, FlightPlan
-from crazyem.live.recorder import open_recorder
+from crazyem.live.history import open_recorder
 from crazyem.live.session import Session
 from crazyem.recordings.registry import open_recording
 from crazyem.signals.sample import Packet, Sample

@@ -97,15 +97,11 @@ def plan_commands(groups: Sequence[Sequence[str]], vehicle: Vehicle, name: str) 
         groups: names of effects, as in `indistinguishable` of a diagnosis.
         vehicle: of the diagnosis. name: of the vehicle in the command.
     """
-    limits, found = Limits(), []
-    for group in groups:
-        for other in group[1:]:
-            if can_discriminate(group[0], other, vehicle, limits):
-                found.append(
-                    f"fly a plan that tells {group[0]} from {other}: crazyem plan --split {group[0]},{other} "
-                    f"--vehicle {name} -o plan.toml"
-                )
-    return found
+    return [
+        f"fly a plan that tells {group[0]} from {other}: crazyem plan --split {group[0]},{other} "
+        f"--vehicle {name} -o plan.toml"
+        for group in groups for other in group[1:] if can_discriminate(group[0], other, vehicle, Limits())
+    ]  # fmt: skip
 
 
 def noise_of(path: str | Path, vehicle: Vehicle) -> Noise:

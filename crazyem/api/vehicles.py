@@ -17,8 +17,7 @@ from crazyem.notebook import finite, html_table
 from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.simulators.constants import NUMBERS
-from crazyem.simulators.convert import Conversion, convert, load_source, read_text
-from crazyem.simulators.cost import HORIZON, errors_after, said
+from crazyem.simulators.convert import HORIZON, Conversion, convert, errors_after, load_source, read_text, said
 from crazyem.simulators.fields import AGREE, SimulatorFile
 from crazyem.simulators.findings import GAUGE, TOLERANCE, FieldFinding, alternatives, field_findings, rescaled
 from crazyem.simulators.sampling import MASS_SD, VehicleSample, sample

@@ -40,7 +40,11 @@ def run(arguments: argparse.Namespace) -> int:
     for duplicate in duplicates:
         report.say("\n" + text_of(duplicate.finding()))
     if several or files.skipped:
-        report.say(f"\n{_graded(report.results)}; {counted(report.results, files.skipped)}")
+        grades = [r.data.get("grade") for r in report.results if not r.error]
+        names = [*(str(g) for g in _WORST_FIRST), "sound"]
+        graded = ", ".join(f"{n} {g}" for g in names if (n := grades.count(g)))
+        counts = counted(report.results, files.skipped)
+        report.say(f"\nrecordings by their worst finding: {graded}; {counts}")
     code = report.close(duplicates=[d.to_dict() for d in duplicates], skipped_files=files.skipped)
     if code == 0 and arguments.strict and any(r.data.get("grade") == str(Grade.UNUSABLE) for r in report.results):
         return DataError.exit_code
@@ -161,9 +165,3 @@ def _wrapped(text: str, indent: str = " " * 12) -> str:
         text, _TEXT_WIDTH, initial_indent=indent, subsequent_indent=indent + "  ",
         break_long_words=False, break_on_hyphens=False,
     )  # fmt: skip
-
-
-def _graded(results: list[Result]) -> str:
-    grades = [r.data.get("grade") for r in results if not r.error]
-    names = [*(str(g) for g in _WORST_FIRST), "sound"]
-    return "recordings by their worst finding: " + ", ".join(f"{n} {g}" for g in names if (n := grades.count(g)))

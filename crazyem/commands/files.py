@@ -77,16 +77,13 @@ class _Search:
             matches = sorted(glob.glob(name, recursive=True))
             if not matches:
                 raise UsageError(f"nothing matches {name}.")
-            for match in matches:
-                self._matched(Path(match))
+            for match in map(Path, matches):
+                if match.is_dir():
+                    self._folder(match)
+                else:
+                    self._file(match, "")
         else:
             self._take(path, "")  # the reader gives the error if it is missing
-
-    def _matched(self, path: Path) -> None:
-        if path.is_dir():
-            self._folder(path)
-        else:
-            self._file(path, "")
 
     def _file(self, path: Path, below: str) -> None:
         """Take a file if it is a recording, else count it as skipped. Nothing else is opened: a pipe would block."""

@@ -5,15 +5,23 @@ import contextlib
 from collections.abc import Iterator
 
 from crazyem.api.flying import FlightObserver, FlightSettings, Progress, observed_flight
-from crazyem.commands.common import LiveLine, plot_path, report, say
-from crazyem.commands.flights import interrupts, write_rules
-from crazyem.commands.view import Stream, SwarmInterrupts, Viewed, live_stream, live_view, wants_view
+from crazyem.commands.flights import (
+    Stream,
+    SwarmInterrupts,
+    Viewed,
+    interrupts,
+    live_stream,
+    live_view,
+    wants_view,
+    write_rules,
+)
+from crazyem.commands.output import LiveLine, plot_path, report, say
 from crazyem.control.named_trajectories import duration_note, trajectory_maker
 from crazyem.errors import CrazyemError
 from crazyem.live.flight import FlightInterruptedError, Interrupts, MotorsCutError
-from crazyem.live.recorder import Recorder
+from crazyem.live.flight_result import check_writable
+from crazyem.live.history import Recorder
 from crazyem.live.session import Session
-from crazyem.live.summary import check_writable
 from crazyem.physics import folding
 
 
@@ -23,26 +31,15 @@ def run(arguments: argparse.Namespace) -> int:
         from crazyem.commands.swarm import fly as fly_many
 
         return fly_many(arguments)
+    same = ("uri", "controller", "duration", "record", "append", "scenario", "seed", "speed", "rate", "reconnect",
+            "window", "every", "monitor", "false_alarms_per_hour")  # fmt: skip
     settings = FlightSettings(
-        uri=arguments.uri,
         vehicle=folding.load(arguments.vehicle),
-        controller=arguments.controller,
         trajectory=tuple(arguments.trajectory),
-        duration=arguments.duration,
         goal=arguments.goal / 100,
         push=not arguments.no_push,
         rules=write_rules(arguments),
-        record=arguments.record,
-        append=arguments.append,
-        scenario=arguments.scenario,
-        seed=arguments.seed,
-        speed=arguments.speed,
-        rate=arguments.rate,
-        reconnect=arguments.reconnect,
-        window=arguments.window,
-        every=arguments.every,
-        monitor=arguments.monitor,
-        false_alarms_per_hour=arguments.false_alarms_per_hour,
+        **{name: getattr(arguments, name) for name in same},
     )
     if arguments.trajectory != ["informative"]:
         trajectory_maker(arguments.trajectory, arguments.duration)  # raises here if invalid

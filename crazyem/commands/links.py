@@ -2,12 +2,13 @@
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 from crazyem.commands.output import put
 from crazyem.errors import UsageError
 from crazyem.links.scan import UDP_PORTS, Interface, scan
-from crazyem.live.summary import check_writable, write_json
+from crazyem.live.flight_result import check_writable, write_json
 
 _INTERFACE_TITLES = {
     "radio": "Radio (Crazyradio)",
@@ -48,7 +49,7 @@ def drones(interfaces: Sequence[Interface]) -> list[str]:
 
 def summary(interfaces: Sequence[Interface]) -> dict[str, Any]:
     """The result for programs."""
-    return {"interfaces": [i.to_json() for i in interfaces], "drones": drones(interfaces)}
+    return {"interfaces": [asdict(i) for i in interfaces], "drones": drones(interfaces)}
 
 
 def text(interfaces: Sequence[Interface]) -> str:

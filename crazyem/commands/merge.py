@@ -1,5 +1,6 @@
 """Merge the results for the parts of a recording too large for memory: one inventory, one list of findings."""
 
+import functools
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import fields, replace
@@ -20,12 +21,7 @@ def merge_inventories(parts: Iterable[Inventory]) -> Inventory:
     Counts and extremes are exact. The median period comes from the part with the most samples. Identifiability comes
     from the best part; the whole recording is at least as informative.
     """
-    total: Inventory | None = None
-    for part in parts:
-        total = part if total is None else _add(total, part)
-    if total is None:
-        raise ValueError("a recording has at least one part")
-    return total
+    return functools.reduce(_add, parts)
 
 
 def _add(a: Inventory, b: Inventory) -> Inventory:

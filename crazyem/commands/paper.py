@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from crazyem.commands.batch import each, processes
-from crazyem.commands.common import say
-from crazyem.commands.output import Result, put
+from crazyem.commands.output import Result, put, say
 from crazyem.errors import UsageError
 from crazyem.paper.settings import READINGS, Settings, describe_text, settings_with
 
@@ -133,8 +132,7 @@ def write_results(folder: Path, results: dict[str, Any]) -> None:
 
 
 def _summary(results: dict[str, Any], folder: Path) -> None:
-    from crazyem.paper.pages import notes
-    from crazyem.paper.table_text import table_grid
+    from crazyem.paper.pages import notes, table_grid
 
     for table in ("II", "III", "IV", "V"):
         grid = table_grid(results["cells"], table)

@@ -15,20 +15,27 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from crazyem.commands.common import LiveLine, compile_kernels, new_estimator, say
-from crazyem.commands.flights import follow, interrupts, write_rules
-from crazyem.commands.output import put
-from crazyem.commands.view import Stream, SwarmInterrupts, Viewed, live_stream, live_view, wants_view
+from crazyem.commands.flights import (
+    Stream,
+    SwarmInterrupts,
+    Viewed,
+    follow,
+    interrupts,
+    live_stream,
+    live_view,
+    wants_view,
+    write_rules,
+)
+from crazyem.commands.output import LiveLine, compile_kernels, new_estimator, put, say
 from crazyem.control.named_trajectories import DEFAULT_HEIGHT, duration_note, trajectory_maker
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links.base import Link
 from crazyem.live.controllers import controller_named
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
-from crazyem.live.flight_result import FlightResult
+from crazyem.live.flight_result import FlightResult, check_writable, interval_text, write_json
 from crazyem.live.runner import connect, finished, open_session
 from crazyem.live.scheduler import Scheduler, UpdateThrottle
 from crazyem.live.session import Session
-from crazyem.live.summary import check_writable, interval_text, write_json
 from crazyem.live.swarm import (
     Course,
     Member,

@@ -2,14 +2,12 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from crazyem.atomic_file import write_file
-from crazyem.commands.common import names_in, say
 from crazyem.commands.files import read_options
-from crazyem.commands.output import deliver
+from crazyem.commands.output import deliver, names_in, say
 from crazyem.errors import DataError, UsageError
-from crazyem.live.summary import check_writable
+from crazyem.live.flight_result import check_writable
 
 BY_SUFFIX = {".urdf": "gym-pybullet-drones", ".sdf": "gazebo", ".py": "rotorpy"}
 
@@ -40,7 +38,7 @@ def _check(arguments: argparse.Namespace) -> int:
     )
     if arguments.write:
         write_file(arguments.write, found.corrected.text)
-    _report(arguments, {**found.to_dict(), "written": arguments.write}, [str(found)])
+    deliver({**found.to_dict(), "written": arguments.write}, arguments.json, str(found))
     return DataError.exit_code if arguments.strict and not found.fits else 0
 
 
@@ -71,7 +69,8 @@ def _convert(arguments: argparse.Namespace) -> int:
     lines += [f"  {remark}" for remark in remarks]
     if made.omissions:
         lines += ["  not held by this file:", *(f"    {omission}" for omission in made.omissions)]
-    return _report(arguments, document, lines)
+    deliver(document, arguments.json, "\n".join(lines))
+    return 0
 
 
 def _sample(arguments: argparse.Namespace) -> int:
@@ -79,8 +78,7 @@ def _sample(arguments: argparse.Namespace) -> int:
 
     from crazyem.commands.predict import write
     from crazyem.physics import folding
-    from crazyem.simulators.convert import convert, read_text
-    from crazyem.simulators.registry import FORMATS, OWN
+    from crazyem.simulators.convert import FORMATS, OWN, convert, read_text
     from crazyem.simulators.sampling import MASS_SD, sample
 
     vehicle = folding.load(arguments.file)
@@ -112,13 +110,13 @@ def _sample(arguments: argparse.Namespace) -> int:
     }  # fmt: skip
     lines = [f"{output}: {arguments.count} drones of {vehicle.name}, seed {arguments.seed}"]
     lines += [f"  {n}: {mean:.4g} +- {sd:.2g}" for n, (mean, sd) in rows.items() if sd > 0.0]
-    return _report(arguments, document, lines)
+    deliver(document, arguments.json, "\n".join(lines))
+    return 0
 
 
 def _several(source: str, form: str | None) -> list[str]:
     """Names of the drones in a source; empty if its format has no names."""
-    from crazyem.simulators.convert import read_text
-    from crazyem.simulators.registry import OWN, format_named, format_of
+    from crazyem.simulators.convert import OWN, format_named, format_of, read_text
     from crazyem.vehicle import preset_names
 
     if source in preset_names():
@@ -130,7 +128,7 @@ def _several(source: str, form: str | None) -> list[str]:
 
 def _target_format(arguments: argparse.Namespace, template: str | None) -> str:
     """The output format from the template or the suffix. Raises UsageError if both are ambiguous."""
-    from crazyem.simulators.registry import NAMES, format_of
+    from crazyem.simulators.convert import NAMES, format_of
 
     if template is not None:
         return format_of(template, where=arguments.template)
@@ -146,8 +144,3 @@ def _check_target(output: Path, arguments: argparse.Namespace) -> None:
     check_writable(str(output))
     if arguments.json not in (None, "-"):
         check_writable(arguments.json)
-
-
-def _report(arguments: argparse.Namespace, document: dict[str, Any], lines: list[str]) -> int:
-    deliver(document, arguments.json, "\n".join(lines))
-    return 0

@@ -8,20 +8,27 @@ import argparse
 import contextlib
 import math
 
-from crazyem.commands.common import LiveLine, compile_kernels, new_estimator, plot_path, report, say
-from crazyem.commands.flights import confirm_in_terminal, follow, interrupts
-from crazyem.commands.view import Stream, Viewed, live_stream, live_view, wants_view
+from crazyem.commands.flights import (
+    Stream,
+    Viewed,
+    confirm_in_terminal,
+    follow,
+    interrupts,
+    live_stream,
+    live_view,
+    wants_view,
+)
+from crazyem.commands.output import LiveLine, compile_kernels, new_estimator, plot_path, report, say
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
 from crazyem.links.base import Link
-from crazyem.live.flight_monitor import monitor_for
-from crazyem.live.hover_thrust import hover_afterwards
-from crazyem.live.policy import Policy, load_policy
+from crazyem.live.flight_result import check_writable
+from crazyem.live.pipeline import monitor_for
+from crazyem.live.policy import Policy, WriteRules, load_policy
+from crazyem.live.push import hover_afterwards
 from crazyem.live.runner import connect, finished, open_session
 from crazyem.live.session import Session
-from crazyem.live.summary import check_writable
 from crazyem.live.telemetry import FLYING
-from crazyem.live.write_supervisor import WriteRules
 from crazyem.physics import folding
 from crazyem.vehicle import Vehicle
 
@@ -67,7 +74,9 @@ def run(arguments: argparse.Namespace) -> int:
             session.history.notice(str(e))
         session.end_pushing(_outcome(session, error))
         session.close()
-        _note_hover_thrust(session)
+        if (supervisor := session.write_supervisor) is not None and (pusher := session.pusher) is not None:
+            target, before = supervisor.guard.controller, supervisor.originals
+            session.history.notice(hover_afterwards(target, now=pusher.known, before=before))
         title, extra = f"crazyem watch {arguments.uri}, vehicle {vehicle.name}", {"uri": arguments.uri}
         result, error = finished(session, title=title, log=arguments.record, extra=extra, error=error)
         try:
@@ -128,10 +137,3 @@ def _outcome(session: Session, error: BaseException | None) -> str:
     if error is not None:
         return "failed"
     return "interrupted" if session.telemetry.has(FLYING) else "landed"
-
-
-def _note_hover_thrust(session: Session) -> None:
-    supervisor, pusher = session.write_supervisor, session.pusher
-    if supervisor is not None and pusher is not None:
-        note = hover_afterwards(supervisor.guard.controller, now=pusher.known, before=supervisor.originals)
-        session.history.notice(note)

@@ -37,8 +37,14 @@ def shared(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], count
     finished = False
     try:
         with _no_interrupts():
+            context = multiprocessing.get_context("spawn")
             for _ in range(count):
-                _start(processes, links)
+                ours, theirs = context.Pipe()
+                with theirs:  # closed in the parent: the pipe then ends with the worker process
+                    process = context.Process(target=_work, args=(theirs,), daemon=True)
+                    process.start()
+                processes.append(process)
+                links.append(ours)
         try:
             for link in links:
                 give(link)
@@ -56,21 +62,11 @@ def shared(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], count
         finished = True
     finally:
         with _no_interrupts():
-            for process, link in zip(processes, links, strict=True):
+            for worker, link in zip(processes, links, strict=True):
                 if not finished:
-                    process.kill()  # the caller needs no further results, so do not wait
+                    worker.kill()  # the caller needs no further results, so do not wait
                 link.close()
-                process.join()
-
-
-def _start(processes: list[multiprocessing.process.BaseProcess], links: list[Connection]) -> None:
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    with theirs:  # closed in the parent: the pipe then ends with the worker process
-        process = context.Process(target=_work, args=(theirs,), daemon=True)
-        process.start()
-    processes.append(process)
-    links.append(ours)
+                worker.join()
 
 
 def _work(link: Connection) -> None:

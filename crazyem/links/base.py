@@ -13,28 +13,7 @@ from typing import Protocol, runtime_checkable
 
 from crazyem.errors import LinkError
 from crazyem.links.clock import ClockFit
-from crazyem.signals.sample import Block, Packet, Variable
-
-__all__ = [
-    "AccountingLink",
-    "AnotherDroneError",
-    "Block",
-    "ClockedLink",
-    "ConfirmingLink",
-    "DescribingLink",
-    "HostClockLink",
-    "HoverThrustLink",
-    "Link",
-    "LinkLost",
-    "LinkStatistics",
-    "Outage",
-    "Packet",
-    "ParameterWrite",
-    "ReconnectingLink",
-    "StreamingLink",
-    "Variable",
-    "link_account",
-]
+from crazyem.signals.sample import Block, Packet
 
 
 class AnotherDroneError(LinkError):
@@ -151,7 +130,6 @@ class Link(Protocol):
     def arm(self, armed: bool) -> None: ...
     def take_off(self, height: float, duration: float) -> None: ...
     def land(self, height: float, duration: float) -> None: ...
-    def go_to(self, x: float, y: float, z: float, yaw: float, duration: float, relative: bool = False) -> None: ...
     def send_full_state(
         self,
         position: Sequence[float],
@@ -161,7 +139,6 @@ class Link(Protocol):
         body_rate: Sequence[float],
     ) -> None: ...
     def send_position(self, x: float, y: float, z: float, yaw: float) -> None: ...
-    def send_hover(self, vx: float, vy: float, yaw_rate: float, z: float) -> None: ...
     def release_setpoints(self) -> None: ...  # "notify stop": hand back to the high-level commander
     def stop(self) -> None: ...  # motors off now
 

@@ -1,9 +1,15 @@
-"""The log blocks of one drone: creation, reception, counts, delays, and restart after an outage."""
+"""The log blocks of one drone: creation, reception, counts, delays, and restart after an outage.
+
+Every reply to a creation, start or deletion is checked: cflib ignores those for appended variables. Most of our blocks
+have ten variables or more, which need two packets. If the second packet is lost, the block delivers packets that are
+too short. If it is repeated, the block has its variables twice.
+"""
 
 import contextlib
 import math
 import queue
 import statistics
+import struct
 import threading
 import time
 from collections import deque
@@ -13,10 +19,89 @@ from typing import Any
 from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import LinkLost, LinkStatistics
 from crazyem.links.clock import ClockFit, ClockRelation, LossCounter, StampUnwrapper
-from crazyem.links.log_control import LogControl
 from crazyem.links.packing import PERIOD_UNIT_MS, pack, period_of
 from crazyem.links.requests import RequestClient, types_of
 from crazyem.signals.sample import Block, Packet
+
+_PORT, _CONTROL = 5, 1
+_DELETE, _START, _CREATE, _APPEND, _START_MS = 2, 3, 6, 7, 8
+ENOENT, _ENOEXEC, _EEXIST = 2, 8, 17
+_REASONS = {
+    ENOENT: "a variable does not exist",
+    7: "too many bytes in it",
+    _ENOEXEC: "the command is unknown",
+    12: "no memory left for blocks or variables",
+    _EEXIST: "it exists already",
+}
+_ITEMS_A_PACKET = 9  # of 3 bytes each, in 28 bytes
+REPLY_WITHIN, REPEAT_AFTER = 0.5, 0.15  # s
+INSTALL_ATTEMPTS = 5
+
+Items = Sequence[tuple[int, int]]  # type byte, index in the table
+
+
+class LogControl:
+    """The log port's commands for one Crazyflie."""
+
+    def __init__(self, requests: RequestClient, uri: str) -> None:
+        self._requests, self._uri = requests, uri
+
+    def install(self, identifier: int, items: Items) -> None:
+        """Create the block with exactly these variables; replaces a block with the same number.
+
+        Raises: LinkError: no answer, or refused.
+        """
+        for attempt in range(INSTALL_ATTEMPTS):
+            if attempt:
+                self._command(bytes((_DELETE, identifier)))
+            packets = [items[i : i + _ITEMS_A_PACKET] for i in range(0, len(items), _ITEMS_A_PACKET)]
+            for number, part in enumerate(packets):
+                head = bytes((_APPEND if number else _CREATE, identifier))
+                body = b"".join(struct.pack("<BH", kind, index) for kind, index in part)
+                status = self._command(head + body, repeat=False)
+                if status in (None, _EEXIST):  # the content of the block is unknown: delete it
+                    break
+                if status:
+                    raise LinkError(f"The drone at {self._uri} refused log block {identifier}: {_reason(status)}.")
+            else:
+                return
+        raise LinkError(f"The drone at {self._uri} did not confirm log block {identifier}.")
+
+    def start(self, identifier: int, period_ms: int) -> bool:
+        """Start the block; False if it does not exist.
+
+        Periods that are not a multiple of 10 ms need a start command in milliseconds, which cflib does not use.
+
+        Raises: UsageError: the firmware does not have this command. LinkError: no answer, or refused.
+        """
+        if period_ms % 10 == 0:
+            status = self._command(bytes((_START, identifier, period_ms // 10)))
+        else:
+            status = self._command(struct.pack("<BBH", _START_MS, identifier, period_ms))
+        if status is None:
+            raise LinkError(f"The drone at {self._uri} did not confirm the start of log block {identifier}.")
+        if status == _ENOEXEC and period_ms % 10:
+            raise UsageError(
+                f"The firmware at {self._uri} cannot log every {period_ms} ms, only every 10 ms or multiples of that."
+            )
+        if status not in (0, ENOENT):
+            raise LinkError(f"The drone at {self._uri} did not start log block {identifier}: {_reason(status)}.")
+        return status == 0
+
+    def delete(self, identifier: int) -> bool:
+        """Delete the block if it exists; returns whether the drone answered."""
+        return self._command(bytes((_DELETE, identifier))) is not None
+
+    def _command(self, data: bytes, *, repeat: bool = True) -> int | None:
+        """Status of a command, None without an answer."""
+        after = REPEAT_AFTER if repeat else None
+        reply = self._requests.request(_PORT, _CONTROL, data, timeout=REPLY_WITHIN, repeat_after=after)
+        return reply[2] if reply is not None and len(reply) > 2 else None
+
+
+def _reason(status: int) -> str:
+    return _REASONS.get(status, f"error {status}")
+
 
 LATE_AFTER = 0.1  # s of delay over the least-delayed packets, above which a packet is late
 _START_ATTEMPT = 0.5  # s to wait for a block's first packet, in addition to its period, before the next attempt
@@ -75,16 +160,13 @@ class LogBlocks:
 
     # --- starting ---------------------------------------------------------------------------------------------------
 
-    def subscribe(
-        self, variables: Sequence[str], rate_hz: float, groups: Sequence[Sequence[str]] | None, lost: Callable[[], str]
-    ) -> tuple[Block, ...]:
+    def subscribe(self, variables: Sequence[str], rate_hz: float, lost: Callable[[], str]) -> tuple[Block, ...]:
         """See `CrazyflieLink.subscribe`; `lost()` gives the reason if the drone counts as lost, else ""."""
         in_use = [b for b in self._cf.log.log_blocks if b.added or b.pending or b.started]
         blocks = pack(
             variables,
             self.available(),
             period_of(rate_hz),
-            groups=groups,
             first_identifier=max(self._counters, default=-1) + 1,
             blocks_in_use=len(in_use),
             variables_in_use=sum(len(b.variables) for b in in_use),
@@ -102,12 +184,10 @@ class LogBlocks:
             except UsageError:
                 if block.period_ms <= PERIOD_UNIT_MS or not block.period_ms % PERIOD_UNIT_MS:
                     raise
-                return self._restart_in_tens(variables, block, groups, lost)
+                return self._restart_in_tens(variables, block, lost)
         return blocks
 
-    def _restart_in_tens(
-        self, variables: Sequence[str], block: Block, groups: Sequence[Sequence[str]] | None, lost: Callable[[], str]
-    ) -> tuple[Block, ...]:
+    def _restart_in_tens(self, variables: Sequence[str], block: Block, lost: Callable[[], str]) -> tuple[Block, ...]:
         """Subscribe again with a multiple of 10 ms, because older firmware refuses other periods."""
         _, config, receive = self._running.pop(block.identifier)
         config.data_received_cb.remove_callback(receive)
@@ -115,11 +195,16 @@ class LogBlocks:
         self._cf.log.log_blocks.remove(config)
         del self._counters[block.identifier]
         tens = max(1, round(block.period_ms / PERIOD_UNIT_MS)) * PERIOD_UNIT_MS
-        return self.subscribe(variables, 1000.0 / tens, groups, lost)
+        return self.subscribe(variables, 1000.0 / tens, lost)
 
     def _configuration(self, block: Block) -> Any:
         """cflib's object for the block, which numbers blocks and decodes packets."""
-        config = _new_configuration(f"crazyem {block.identifier}", max(block.period_ms, 10))
+        from cflib.crazyflie.log import LogConfig
+
+        class Configuration(LogConfig):  # always counts as added; else cflib would start it before it is complete
+            added = property(lambda self: True, lambda self, value: None)
+
+        config = Configuration(f"crazyem {block.identifier}", max(block.period_ms, 10))
         for variable in block.variables:
             config.add_variable(variable.name)
         try:
@@ -284,16 +369,6 @@ class LogBlocks:
     def newest_ms(self) -> float:
         """Newest unwrapped stamp, ms; -inf before the first."""
         return self._newest
-
-
-def _new_configuration(name: str, period_ms: int) -> Any:
-    """A LogConfig that always counts as added; else cflib would start the block at a reply, before it is complete."""
-    from cflib.crazyflie.log import LogConfig
-
-    class Configuration(LogConfig):
-        added = property(lambda self: True, lambda self, value: None)
-
-    return Configuration(name, period_ms)
 
 
 def _median_and_p99(values: list[float]) -> tuple[float, float]:

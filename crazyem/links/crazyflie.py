@@ -15,10 +15,8 @@ from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import AnotherDroneError, LinkLost, LinkStatistics, Outage, ParameterWrite
 from crazyem.links.blocks import LogBlocks
 from crazyem.links.clock import ClockFit
-from crazyem.links.connection import add_callbacks, connect, quiet_cflib, shut
-from crazyem.links.parameters import ParameterClient
-from crazyem.links.reconnection import Reconnector
-from crazyem.links.requests import land_command, send_until_confirmed
+from crazyem.links.connection import Reconnector, add_callbacks, connect, quiet_cflib, shut
+from crazyem.links.requests import ParameterClient, land_command, send_until_confirmed
 from crazyem.signals.sample import Block, Packet
 
 SILENT_AFTER = 2.0  # s without log data from running blocks, after which the drone counts as lost
@@ -137,21 +135,18 @@ class CrazyflieLink:
         self._connected()
         return self._blocks.available()
 
-    def subscribe(
-        self, variables: Sequence[str], rate_hz: float, groups: Sequence[Sequence[str]] | None = None
-    ) -> tuple[Block, ...]:
+    def subscribe(self, variables: Sequence[str], rate_hz: float) -> tuple[Block, ...]:
         """Pack variables into blocks and start them; returns once every block delivers.
 
         Args:
             variables: names, in any order.
             rate_hz: of all variables: 0.4 to 100 Hz, rounded to periods of 10 ms; up to 1000 Hz, rounded to 1 ms, if
                 the firmware allows periods in milliseconds.
-            groups: names that must be sampled together; None = the components of each signal.
 
         Raises: UsageError (unknown variable, does not fit, too fast for this firmware), LinkError (does not start).
         """
         self._connected()
-        return self._blocks.subscribe(variables, rate_hz, groups, lambda: self._lost)
+        return self._blocks.subscribe(variables, rate_hz, lambda: self._lost)
 
     def statistics(self) -> LinkStatistics:
         """Packets received, lost (computed from stamps) and late, delays, clocks: in total and per block."""
@@ -255,11 +250,6 @@ class CrazyflieLink:
         return self._parameter_client().types()
 
     @property
-    def parameter_fault(self) -> str:
-        """Why the last parameter access had no answer; "" if parameters work."""
-        return self._parameters.fault if self._parameters is not None else ""
-
-    @property
     def about(self) -> Mapping[str, Mapping[str, str]]:
         """Description of the firmware for recordings.
 
@@ -284,7 +274,7 @@ class CrazyflieLink:
     def write_parameter(self, name: str, value: float, timeout: float = 1.0) -> ParameterWrite:
         """Write and verify: `verified` only if the drone echoed exactly the value's bits in the parameter's type.
 
-        No echo within `timeout` gives `verified=False` and a `parameter_fault`; the link stays usable.
+        No echo within `timeout` gives `verified=False`; the link stays usable.
 
         Raises: UsageError: an unknown or read-only parameter, or a value that does not fit its type. LinkError: the
         drone is lost.
@@ -326,10 +316,6 @@ class CrazyflieLink:
         command = land_command(height, duration)
         return send_until_confirmed(self._command(), command, timeout=timeout, repeat_after=0.04)
 
-    def go_to(self, x: float, y: float, z: float, yaw: float, duration: float, relative: bool = False) -> None:
-        """High-level move to x, y, z [m, world] and yaw [rad] in `duration` [s]."""
-        self._command().high_level_commander.go_to(x, y, z, yaw, duration, relative)
-
     def send_full_state(
         self,
         position: Sequence[float],
@@ -359,10 +345,6 @@ class CrazyflieLink:
     def send_position(self, x: float, y: float, z: float, yaw: float) -> None:
         """Position setpoint: x, y, z [m, world], yaw [rad] (degrees on the wire)."""
         self._command().commander.send_position_setpoint(x, y, z, math.degrees(yaw))
-
-    def send_hover(self, vx: float, vy: float, yaw_rate: float, z: float) -> None:
-        """Hover setpoint: vx, vy [m/s, body], yaw rate [rad/s] (degrees per second on the wire), z [m, world]."""
-        self._command().commander.send_hover_setpoint(vx, vy, math.degrees(yaw_rate), z)
 
     def release_setpoints(self) -> None:
         """Send "notify stop": low-level setpoints have ended, and the high-level commander may act again."""

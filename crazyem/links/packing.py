@@ -1,5 +1,6 @@
 """Packing of log variables into blocks: 26 bytes per packet, 16 blocks, 128 variables."""
 
+import difflib
 import math
 from collections.abc import Mapping, Sequence
 
@@ -65,7 +66,9 @@ def pack(
     wanted = list(dict.fromkeys(variables))
     for name in wanted:
         if name not in available:
-            raise UsageError(f'The drone has no log variable "{name}"{_hint(name, available)}.')
+            close = difflib.get_close_matches(name, list(available), n=1, cutoff=0.7)
+            hint = f' (did you mean "{close[0]}"?)' if close else ""
+            raise UsageError(f'The drone has no log variable "{name}"{hint}.')
         if available[name] not in CTYPE_SIZES:
             raise UsageError(f'The log variable "{name}" has type {available[name]}, which cannot be logged.')
     if variables_in_use + len(wanted) > MAX_VARIABLES:
@@ -122,11 +125,3 @@ def _units(
             units.extend((n,) for n in names)
     units.extend((n,) for n in wanted if n not in taken)
     return units
-
-
-def _hint(name: str, available: Mapping[str, str]) -> str:
-    """Close names, for the error message."""
-    import difflib
-
-    close = difflib.get_close_matches(name, list(available), n=1, cutoff=0.7)
-    return f' (did you mean "{close[0]}"?)' if close else ""

@@ -12,7 +12,7 @@ import select
 import socket
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -60,10 +60,6 @@ class Interface:
     found: list[Found] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
 
-    def to_json(self) -> dict[str, Any]:
-        """For programs."""
-        return asdict(self)
-
 
 def scan(
     *,
@@ -86,7 +82,7 @@ def scan(
     rules = udev_vendors(root)
     return [
         _radio(devices, rules, search_air or _search_air if air else None),
-        _usb(devices, rules),
+        _by_cable("usb", "Crazyflie", devices, rules, "no Crazyflie is plugged in"),
         _udp(host, ports),
         _serial(serial_ports or _comports, root),
     ]
@@ -162,26 +158,32 @@ def _rule_advice(rules: set[str]) -> list[str]:
     ]
 
 
-def _plugged(interface: Interface, devices: list[Device], loaders: list[Device], rules: set[str]) -> None:
-    """Add plugged-in devices to the interface, with numbers as in their addresses."""
-    for number, device in enumerate(devices):
-        name = device.name + (f", serial {device.serial}" if device.serial else "")
-        address = f"{interface.name}://{number}"
-        interface.found.append(Found(address, name, "" if device.usable else _no_rights(device, rules)))
+def _by_cable(name: str, loader: str, devices: list[Device], rules: set[str], absent: str) -> Interface:
+    """Plugged-in devices of one kind, numbered as in their addresses, and what is missing.
+
+    Args:
+        name: of the interface and kind of its devices. loader: word in the names of their bootloaders.
+        absent: sentence if there is none.
+    """
+    interface = Interface(name)
+    plugged = [d for d in devices if d.kind == name]
+    for number, device in enumerate(plugged):
+        what = device.name + (f", serial {device.serial}" if device.serial else "")
+        interface.found.append(Found(f"{name}://{number}", what, "" if device.usable else _no_rights(device, rules)))
+    loaders = [d for d in devices if d.kind == "bootloader" and loader in d.name]
     interface.found += [Found("", device.name, "in its bootloader") for device in loaders]
+    if not interface.found:
+        interface.missing.append(absent)
+    if any(not d.usable for d in plugged):
+        interface.missing += _rule_advice(rules)
+    return interface
 
 
 def _radio(devices: list[Device], rules: set[str], search: Callable[[], list[str]] | None) -> Interface:
-    interface = Interface("radio")
-    radios = [d for d in devices if d.kind == "radio"]
-    loaders = [d for d in devices if d.kind == "bootloader" and "radio" in d.name]
-    _plugged(interface, radios, loaders, rules)
-    if not radios and not loaders:
-        rule = "" if "1915" in rules else f" (nor is there a udev rule for one; it would go into {UDEV_RULES_FILE})"
-        interface.missing.append(f"no Crazyradio dongle is plugged in{rule}")
-    if any(not d.usable for d in radios):
-        interface.missing += _rule_advice(rules)
-    elif radios and search is not None:
+    rule = "" if "1915" in rules else f" (nor is there a udev rule for one; it would go into {UDEV_RULES_FILE})"
+    interface = _by_cable("radio", "radio", devices, rules, f"no Crazyradio dongle is plugged in{rule}")
+    radios = [f for f in interface.found if f.uri]
+    if radios and not any(f.problem for f in radios) and search is not None:
         try:
             uris = search()
         except Exception as error:  # cflib and libusb may raise any error
@@ -190,18 +192,6 @@ def _radio(devices: list[Device], rules: set[str], search: Callable[[], list[str
             interface.found += [Found(uri, "a drone on the air") for uri in uris]
             if not uris:
                 interface.missing.append("no drone answers on its default address: is one switched on?")
-    return interface
-
-
-def _usb(devices: list[Device], rules: set[str]) -> Interface:
-    interface = Interface("usb")
-    drones = [d for d in devices if d.kind == "usb"]
-    loaders = [d for d in devices if d.kind == "bootloader" and "Crazyflie" in d.name]
-    _plugged(interface, drones, loaders, rules)
-    if not drones and not loaders:
-        interface.missing.append("no Crazyflie is plugged in")
-    if any(not d.usable for d in drones):
-        interface.missing += _rule_advice(rules)
     return interface
 
 

@@ -7,10 +7,9 @@ from typing import Protocol
 
 from crazyem.errors import DataError
 from crazyem.estimation.result import Estimate
-from crazyem.live.flight_monitor import monitor_for
-from crazyem.live.policy import Policy, load_policy
+from crazyem.live.pipeline import monitor_for
+from crazyem.live.policy import Policy, WriteRules, load_policy
 from crazyem.live.session import Session
-from crazyem.live.write_supervisor import WriteRules
 from crazyem.monitoring.fault import Fault
 from crazyem.physics import folding
 from crazyem.vehicle import Vehicle
@@ -116,7 +115,7 @@ def attach(
     """
     from crazyem.estimation.steps import estimator_for
     from crazyem.links.crazyflie import CrazyflieLink
-    from crazyem.live.warm_up import warm_up
+    from crazyem.live.runner import warm_up
 
     rules = WriteRules(policy if isinstance(policy, Policy) else load_policy(policy), dry_run=dry_run)
     model, left_out = folding.fold(vehicle if isinstance(vehicle, Vehicle) else folding.load(vehicle))

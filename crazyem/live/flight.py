@@ -10,11 +10,11 @@ from crazyem.control.indi import PARAMETERS, IndiGains
 from crazyem.control.trajectories import Trajectory, Vector, after_hover
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links.base import ConfirmingLink, HostClockLink, Link
+from crazyem.live.clock import SetpointStream
 from crazyem.live.controllers import Controller
+from crazyem.live.policy import WriteRules
 from crazyem.live.session import Session
-from crazyem.live.stream import SetpointStream
 from crazyem.live.telemetry import ARMED, CAN_FLY, FLYING
-from crazyem.live.write_supervisor import WriteRules
 
 BASELINE_SECONDS = 3.0  # s of hover before the first push: shows the behaviour with the present parameters
 CONFIRMED_WITHIN = 0.25  # s to confirm the plan to land; without setpoints the drone levels out after 0.5 s
@@ -227,7 +227,8 @@ class Flight:
             self._hand_over(duration)
             self._sleep(duration)
             try:
-                self._wait(self._landed, 5.0, "did not land")
+                self._wait(lambda: not self.telemetry.has(FLYING) and not self.telemetry.height > self._ground + 0.15,
+                           5.0, "did not land")  # fmt: skip
                 break
             except LinkError:
                 raise
@@ -264,9 +265,6 @@ class Flight:
             link.land(self._ground, duration)
             self._sleep(HAND_OVER_EVERY)
             link.release_setpoints()
-
-    def _landed(self) -> bool:
-        return not self.telemetry.has(FLYING) and not self.telemetry.height > self._ground + 0.15
 
     # ways out
 

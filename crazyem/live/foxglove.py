@@ -12,7 +12,7 @@ from typing import Any
 
 from crazyem.errors import UsageError
 from crazyem.extras import require
-from crazyem.live.recorder import Recorder
+from crazyem.live.history import Recorder
 from crazyem.recordings.mcap.writer import RecordingWriter
 
 FOXGLOVE_PORT = 8765  # default port of viewers
@@ -132,11 +132,7 @@ class Both:
     def __init__(self, file: Recorder | None, stream: Recorder) -> None:
         self._file = file
         self._all: list[Recorder] = [r for r in (file, stream) if r is not None]
-
-    @property
-    def path(self) -> str:
-        """Of the file."""
-        return self._file.path if self._file is not None else ""
+        self.path = file.path if file is not None else ""
 
     @property
     def failure(self) -> str:

@@ -8,8 +8,7 @@ from typing import Any
 
 from crazyem.estimation.result import Estimate, ParameterEstimate, Step
 from crazyem.estimation.verdict import NOT_CONVERGED
-from crazyem.live.beliefs import DRAG_NAMES, INERTIA_NAMES
-from crazyem.live.controllers import Controller, writes_for
+from crazyem.live.controllers import DRAG_NAMES, INERTIA_NAMES, Controller, writes_for
 
 # After a change of mass the old value is known to be wrong. So the new value has to agree for this share of the
 # agreement time only, and may follow the last write after this share of the interval.

@@ -4,6 +4,7 @@
 """
 
 import math
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import resources
@@ -137,6 +138,30 @@ class Policy:
                 remark = f" # {against.name}: {toml_value(other)}" if against and other != value else ""
                 lines.append(f"{key} = {toml_value(value)}{remark}")
         return "\n".join(lines) + "\n"
+
+
+Confirm = Callable[[str, threading.Event], bool]
+
+
+@dataclass(frozen=True)
+class WriteRules:
+    """How estimates may reach the drone.
+
+    Attributes:
+        policy: see `Policy`.
+        dry_run: make and record decisions, but write nothing.
+        confirm: called once, in its own thread, before the first write, with the question and an event that is set when
+            the answer is no longer needed; True allows pushes. None: no confirmation.
+    """
+
+    policy: Policy = field(default_factory=Policy)
+    dry_run: bool = False
+    confirm: Confirm | None = None
+
+    @property
+    def mode(self) -> str:
+        """Text for the summary."""
+        return "dry run" if self.dry_run else "push after confirmation" if self.confirm else "push"
 
 
 @dataclass(frozen=True)

@@ -216,30 +216,26 @@ class PostWriteMonitor:
     def judge(self, time: float) -> tuple[str, str]:
         """Verdict at `time` [s]: ("good", figures), ("worse", why), or ("", "") if undecided or nothing is to judge."""
         with self._lock:
-            return self._judge(self._reference, self._last, time)
-
-    def _judge(self, before: Figures | None, last: float, time: float) -> tuple[str, str]:
-        if before is None or not self.limits.enabled:
-            return "", ""
-        alarm = self._alarm(before, time)
-        if alarm:
-            return "worse", alarm
-        start = last + self.limits.settle
-        if self._excused[1] > self._first:
-            start = max(start, self._excused[1])
-            if self._unwritten:  # an unwritten mass causes the error, not the writes
-                before = replace(before, tracking=math.nan)
-        if time - start < min(1.0, self.limits.after):
-            return "", ""
-        after = self.figures(start, time)
-        why = self._worse(before, after)
-        if why:
-            return "worse", why
-        if time - start < self.limits.after:
-            return "", ""
-        if math.isnan(after.tracking) and math.isnan(after.oscillation):
-            return "", ""  # an outage: no data, so no verdict
-        return "good", f"{_said(before)} before, {_said(after)} after"
+            before = self._reference
+            if before is None or not self.limits.enabled:
+                return "", ""
+            if alarm := self._alarm(before, time):
+                return "worse", alarm
+            start = self._last + self.limits.settle
+            if self._excused[1] > self._first:
+                start = max(start, self._excused[1])
+                if self._unwritten:  # an unwritten mass causes the error, not the writes
+                    before = replace(before, tracking=math.nan)
+            if time - start < min(1.0, self.limits.after):
+                return "", ""
+            after = self.figures(start, time)
+            if why := self._worse(before, after):
+                return "worse", why
+            # without data (an outage) there is no verdict
+            known = not (math.isnan(after.tracking) and math.isnan(after.oscillation))
+            if time - start < self.limits.after or not known:
+                return "", ""
+            return "good", f"{_said(before)} before, {_said(after)} after"
 
     def _alarm(self, before: Figures, time: float) -> str:
         limits, now = self.limits, self.figures(time - ALARM_SECONDS, time, 5)

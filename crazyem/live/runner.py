@@ -1,20 +1,29 @@
-"""Functions from a URI to the result of a session, common to `fly` and `watch`."""
+"""Functions from a URI to the result of a session, common to `fly` and `watch`, and the compilation before a flight.
+
+A compilation in flight would stop all Python threads, also setpoints, for seconds.
+"""
 
 import contextlib
+import math
+import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from crazyem.compiled import compilations
 from crazyem.errors import CrazyemError
+from crazyem.estimation.in_step import PERIOD
+from crazyem.estimation.online import OnlineEstimator
 from crazyem.links import open_link
 from crazyem.links.base import Link
-from crazyem.live.flight_monitor import FlightMonitor
 from crazyem.live.flight_result import FlightResult, result_of
-from crazyem.live.pipeline import Estimator
-from crazyem.live.recorder import Recorder, close_recorder, open_recorder
+from crazyem.live.history import Recorder, open_recorder
+from crazyem.live.pipeline import Estimator, FlightMonitor
+from crazyem.live.policy import FaultRules
 from crazyem.live.scheduler import Scheduler
 from crazyem.live.session import Session
 from crazyem.monitoring.fault import Fault
 from crazyem.physics import folding
+from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle
 
 
@@ -68,9 +77,12 @@ def finished(
     session: Session, *, title: str, log: str | None, extra: Mapping[str, Any], error: BaseException | None
 ) -> tuple[FlightResult | None, BaseException | None]:
     """Close the recording of a closed session; returns its result and the first error (`error`, or the result's)."""
-    statistics = session.link.statistics()
-    if session.recorder is not None:
-        close_recorder(session.recorder, statistics, session.history)
+    statistics, recorder = session.link.statistics(), session.recorder
+    if recorder is not None:
+        counts = ("received", "lost", "late", "duplicates")
+        recorder.metadata("statistics", {n: str(getattr(statistics, n)) for n in counts})
+        recorder.close()
+        session.history.notice(recorder.failure)
     try:
         result = result_of(
             session.pipeline, session.vehicle, title=title, log=log, received=statistics.received,
@@ -79,3 +91,30 @@ def finished(
     except CrazyemError as late:
         return None, error or late
     return result, error
+
+
+def warm_up(vehicle: Vehicle) -> float:
+    """Run every kernel once; returns the seconds if any kernel was compiled, 0.0 if all came from the disk."""
+    begun, before = time.monotonic(), compilations()
+    estimator = OnlineEstimator(vehicle, window=100, every=4, prediction_period=PERIOD)
+    FlightMonitor(vehicle, FaultRules()).watch(estimator)
+    hover = 0.5
+    try:
+        for i in range(160):
+            t = PERIOD * i
+            s = 0.01 * math.sin(7 * t)
+            for name, value in (
+                ("flying", (1.0,)),
+                ("voltage", (3.9,)),
+                ("motor_command", (hover + s, hover - s, hover + 2 * s, hover - 2 * s)),
+                ("position", (s, -s, 1.0 + s)),
+                ("velocity", (7 * s, 7 * s, s)),
+                ("attitude", (s, s, s, math.sqrt(1 - 3 * s * s))),
+                ("body_rate", (s, s, s)),
+                ("specific_force", (s, s, 9.81)),
+            ):
+                estimator.feed(Sample(name, t, value))
+        estimator.finish()
+    except CrazyemError:
+        pass  # these artificial data may be refused; only the compilation matters
+    return time.monotonic() - begun if compilations() > before else 0.0

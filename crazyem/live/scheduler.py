@@ -16,7 +16,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from crazyem.estimation.result import Estimate
-from crazyem.live.pipeline import residual_of
 from crazyem.signals.sample import Sample
 
 POLL_PAUSE = 0.002  # s between two rounds of receiving: a twentieth of an update's budget
@@ -138,10 +137,6 @@ class Scheduler:
             thread.start()
         self.poller = PacketPoller()
 
-    def mailbox(self, work: Callable[[Any], None], failed: Callable[[Exception], None]) -> Mailbox:
-        """A new mailbox; see `Mailbox`."""
-        return Mailbox(self, work, failed)
-
     def enqueue(self, mailbox: Mailbox) -> None:
         """Queue a mailbox for a worker (called by mailboxes)."""
         self._ready.put(mailbox)
@@ -203,7 +198,7 @@ class UpdateThrottle:
     @property
     def residual(self) -> Any:
         """Of the inner estimator, None if it has none."""
-        return residual_of(self.inner)
+        return getattr(self.inner, "residual", None)
 
     def feed(self, sample: Sample) -> Estimate | None:
         """One sample; see `OnlineEstimator.feed`."""

@@ -1,7 +1,7 @@
 """A running estimation over an open link: packets become samples, go through the pipeline, and are recorded.
 
 Threads: one receives (records, updates clock and telemetry; it is fast, so telemetry is always fresh), one estimates,
-one writes parameters. Setpoints have their own thread (stream.py). No thread waits for another. In a process with many
+one writes parameters. Setpoints have their own thread (clock.py). No thread waits for another. In a process with many
 sessions, a scheduler receives and estimates for all of them (scheduler.py).
 """
 
@@ -16,33 +16,27 @@ from crazyem.estimation.result import Estimate
 from crazyem.links.base import (
     AccountingLink,
     AnotherDroneError,
-    Block,
     ClockedLink,
     HostClockLink,
     HoverThrustLink,
     Link,
     LinkLost,
     Outage,
-    Packet,
     ReconnectingLink,
     StreamingLink,
     link_account,
 )
 from crazyem.live.clock import FirmwareClock
-from crazyem.live.flight_monitor import FlightMonitor, event_lines
 from crazyem.live.guard import Guard
-from crazyem.live.history import History
-from crazyem.live.hover_thrust import hover_rules, hover_target
-from crazyem.live.pipeline import Estimator, Pipeline, residual_of
-from crazyem.live.policy import load_policy
-from crazyem.live.push import Pusher, nominal_estimates, push_target, read_originals
-from crazyem.live.recorder import FrameRecorder, Recorder
-from crazyem.live.scheduler import Scheduler
-from crazyem.live.telemetry import Telemetry
-from crazyem.live.write_gate import WriteGate
-from crazyem.live.write_supervisor import WriteRules, WriteSupervisor
+from crazyem.live.history import FrameRecorder, History, Recorder
+from crazyem.live.pipeline import Estimator, FlightMonitor, Pipeline, event_lines
+from crazyem.live.policy import WriteRules, load_policy
+from crazyem.live.push import Pusher, hover_rules, hover_target, nominal_estimates, push_target, read_originals
+from crazyem.live.scheduler import Mailbox, Scheduler
+from crazyem.live.telemetry import Telemetry, WriteGate
+from crazyem.live.write_supervisor import WriteSupervisor
 from crazyem.monitoring.fault import Fault
-from crazyem.signals.sample import Sample
+from crazyem.signals.sample import Block, Packet, Sample
 from crazyem.signals.vocabulary import block_plan, decoders
 from crazyem.vehicle import Vehicle
 
@@ -109,7 +103,7 @@ class Session:
         self.blocks: tuple[Block, ...] = ()
         self._samples: queue.SimpleQueue[list[Sample] | None] = queue.SimpleQueue()
         self._scheduler = scheduler
-        self._mailbox = scheduler.mailbox(self._feed, self._estimating_failed) if scheduler is not None else None
+        self._mailbox = Mailbox(scheduler, self._feed, self._estimating_failed) if scheduler is not None else None
         self._receiving_ended = False  # nothing is received any more
         self._reconnection: threading.Thread | None = None  # with a scheduler only: its thread must not wait
         self._link_recorded = -math.inf
@@ -177,7 +171,7 @@ class Session:
             history=self.history,
             gate=gate,
             now=lambda: self.clock.newest,
-            residual=lambda: residual_of(self.pipeline.estimator),
+            residual=lambda: getattr(self.pipeline.estimator, "residual", None),
             enabled=lambda time: self.pipeline.push_from <= time <= self.pipeline.push_until,
             record=self.record_event,
             fault=self.pipeline.fault_objection,
@@ -214,11 +208,6 @@ class Session:
         The receiving thread sets the end time between two packets and records it, so that a replay uses the same.
         """
         self._end_wanted = True
-
-    def _draw_end(self) -> None:
-        until = self.clock.newest  # of the packets before this one; later packets may still carry older stamps
-        self.pipeline.estimate_until = until
-        self.mark("estimate_end", until)
 
     def mark(self, name: str, time: float) -> None:
         """Add a mark at `time` [s] of the drone's clock to history and recording."""
@@ -276,7 +265,7 @@ class Session:
     def _estimated(self, estimate: Estimate) -> None:
         if self.recorder is not None:
             self.recorder.estimate(estimate)
-            residual = residual_of(self.pipeline.estimator)
+            residual = getattr(self.pipeline.estimator, "residual", None)
             if residual is not None:
                 self.recorder.residual(*residual)
         if self._on_estimate is not None:
@@ -394,7 +383,9 @@ class Session:
 
     def _packet(self, packet: Packet) -> None:
         if self._end_wanted and self.pipeline.estimate_until == math.inf and math.isfinite(self.clock.newest):
-            self._draw_end()
+            until = self.clock.newest  # of the packets before this one; later packets may still carry older stamps
+            self.pipeline.estimate_until = until
+            self.mark("estimate_end", until)
         self.clock.observe(packet.firmware_time_ms / 1000.0)
         names = self._names.get(packet.block)
         if names is None:
@@ -403,7 +394,10 @@ class Session:
             self.recorder.packet(packet)
             if packet.host_time - self._link_recorded >= LINK_RECORD_PERIOD:
                 self._link_recorded = packet.host_time
-                self._record_link(packet)
+                fit = self.link.clock() if isinstance(self.link, ClockedLink) else None
+                # latency against the fastest packets
+                late = math.nan if fit is None else packet.host_time - fit.to_host(packet.firmware_time_ms)
+                self.recorder.link(self.link.statistics(), late)
         if "supervisor.info" in names:
             info = packet.values[names.index("supervisor.info")]
             self.telemetry.info = int(info) if math.isfinite(info) else None
@@ -422,13 +416,6 @@ class Session:
         if self.write_supervisor is not None:
             self.write_supervisor.take(samples)
         (self._samples if self._mailbox is None else self._mailbox).put(samples)
-
-    def _record_link(self, packet: Packet) -> None:
-        """Record the link's statistics, and the latency against the fastest packets if the link has a clock fit."""
-        assert self.recorder is not None
-        fit = self.link.clock() if isinstance(self.link, ClockedLink) else None
-        late = math.nan if fit is None else packet.host_time - fit.to_host(packet.firmware_time_ms)
-        self.recorder.link(self.link.statistics(), late)
 
     def _estimate(self) -> None:
         try:

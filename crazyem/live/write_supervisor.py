@@ -9,7 +9,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 from crazyem.control.indi import IndiResponse
@@ -18,10 +18,10 @@ from crazyem.estimation.result import Estimate, Step
 from crazyem.live.controllers import EQUAL_WITHIN, writes_back
 from crazyem.live.guard import Decision, Guard
 from crazyem.live.history import History
-from crazyem.live.policy import Policy
+from crazyem.live.policy import WriteRules
 from crazyem.live.post_write_monitor import PostWriteMonitor
 from crazyem.live.push import Pusher
-from crazyem.live.write_gate import WriteGate
+from crazyem.live.telemetry import WriteGate
 from crazyem.signals.sample import Sample
 
 # s, 4 Hz, second order: with too high a loop gain INDI oscillates with 7 to 12 Hz; an excitation has 1 to 4 Hz.
@@ -30,29 +30,6 @@ MONITOR_PERIOD = 0.04  # s between judgements
 GROUNDED_WITHIN = 3.0  # s, longest wait for the ground: the firmware reports a flight for 2 s after the motors stop
 HOLD_NOTE_PERIOD = 1.0  # s, shortest time between two notes about the reason why nothing is written
 MOST_ACCOUNT_ENTRIES = 5000  # most entries of the account: bounds the memory
-
-Confirm = Callable[[str, threading.Event], bool]
-
-
-@dataclass(frozen=True)
-class WriteRules:
-    """How estimates may reach the drone.
-
-    Attributes:
-        policy: see `Policy`.
-        dry_run: make and record decisions, but write nothing.
-        confirm: called once, in its own thread, before the first write, with the question and an event that is set when
-            the answer is no longer needed; True allows pushes. None: no confirmation.
-    """
-
-    policy: Policy = field(default_factory=Policy)
-    dry_run: bool = False
-    confirm: Confirm | None = None
-
-    @property
-    def mode(self) -> str:
-        """Text for the summary."""
-        return "dry run" if self.dry_run else "push after confirmation" if self.confirm else "push"
 
 
 class WriteSupervisor:

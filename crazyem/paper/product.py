@@ -88,18 +88,15 @@ def product_offline(
     first: int = 0,
     last: int | None = None,
     *,
-    mass: float | None = None,
-    inertia: tuple[float, float, float] | None = None,
     known: KnownNoise | None = None,
     accelerometer: bool = True,
 ) -> Fit:
     """One converged estimate from rows first..last-1 as a single window.
 
     Args:
-        flight: only its samples and settings are used.
+        flight: only its samples and settings (with the values to start from) are used.
         sensor, known, accelerometer: as for `estimator_for`.
         first, last: rows; last defaults to all rows flown.
-        mass, inertia: kg, (3,) kg m^2 to start from, where they differ from the settings.
 
     Raises: UsageError: no such sensor, or too few rows.
     """
@@ -107,10 +104,6 @@ def product_offline(
     if not 0 <= first < last <= flight.size:
         raise UsageError(f"rows {first} to {last} are not in a flight of {flight.size} rows")
     settings = replace(flight.settings, window=last - first, every=NO_UPDATE)
-    if mass is not None:
-        settings = replace(settings, mass_start=mass)
-    if inertia is not None:
-        settings = replace(settings, inertia_start=inertia)
     estimator = estimator_for(settings, sensor, known=known, accelerometer=accelerometer)
     for sample in flight.samples(sensor, first, last):
         estimator.feed(sample)

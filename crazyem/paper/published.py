@@ -142,9 +142,7 @@ def expectation(
     mass = theta[0]
     inertia = theta[1:]
     pl = np.array([p0, 0.0, p0])
-    pa = np.zeros((6, 6))
-    for i in range(6):
-        pa[i, i] = p0
+    pa = p0 * np.eye(6)
     for k in range(n):
         if k:
             transition(x, dt, phi)
@@ -155,17 +153,12 @@ def expectation(
             pl[1] += dt * pl[2]
             pl[2] += q
             _predict_angular(pa, a, b, q, half)
-        for i in range(12):
-            predicted[k, i] = x[i]
+        predicted[k] = x
         _correct_linear(pl, x, observed[k], r)
         _correct_angular(pa, x, observed[k], r, sees_angles, gain)
-        for i in range(12):
-            filtered[k, i] = x[i]
-        for i in range(3):
-            linear[k, i] = pl[i]
-        for i in range(6):
-            for j in range(6):
-                angular[k, i, j] = pa[i, j]
+        filtered[k] = x
+        linear[k] = pl
+        angular[k] = pa
     _smooth(n, q, predicted, filtered, linear, angular, smoothed)
 
 
@@ -174,8 +167,7 @@ def _smooth(n, q, predicted, filtered, linear, angular, smoothed):
     """Eq. 94-97: means backwards with the gain P (P + Q)^-1."""
     lower = np.empty((6, 6))
     d = np.empty(6)
-    for i in range(12):
-        smoothed[n - 1, i] = filtered[n - 1, i]
+    smoothed[n - 1] = filtered[n - 1]
     for k in range(n - 2, -1, -1):
         rr, rv, vv = linear[k, 0], linear[k, 1], linear[k, 2]
         srr, svv = rr + q, vv + q

@@ -23,7 +23,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 # Files on which the numbers of a task depend. Tables and figures are made anew in each run.
 _CODE = ("physics/**/*.py", "signals/**/*.py", "control/**/*.py", "estimation/**/*.py", "presets/zhao.toml",
          "vehicle.py", "compiled.py", "paper/*.py")  # fmt: skip
-_TEXT_MODULES = ("runner", "tables", "table_text", "figures", "pages", "published_values")
+_TEXT_MODULES = ("runner", "tables", "figures", "pages", "published_values")
 _NOT_CODE = {f"paper/{name}.py" for name in _TEXT_MODULES}
 _VERSIONED_PACKAGES = ("numpy", "scipy", "numba")
 

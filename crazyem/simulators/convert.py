@@ -1,22 +1,158 @@
-"""Convert a vehicle to a simulator's file and back; report what the file cannot hold and the error this causes."""
+"""Convert a vehicle to a simulator's file and back; report what the file cannot hold and the error this causes.
 
+Every `Format` in a module of `formats/` is known by its name, and recognised by its text.
+
+The cost of an omission is the distance between two models after half a second of flight from the same states. Without a
+recording the reference flight is synthetic: a hundred starts of brisk flight (up to 1.5 m/s, 15 degrees, 1 rad/s) with
+rotor commands around hover. With a recording, states and inputs come from the recording.
+"""
+
+import importlib
 import math
+import pkgutil
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.flights.inputs import Inputs
+from crazyem.diagnosis.prediction.horizon import UNITS, error_lengths, lengths, open_loop, windows
+from crazyem.diagnosis.prediction.predict import recorded
+from crazyem.diagnosis.prediction.simulate import Simulator
 from crazyem.errors import FileFormatError, UsageError
+from crazyem.notebook import finite
 from crazyem.physics import folding
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.supply import THRUST_CURVE
+from crazyem.physics.motion import RotorInput
+from crazyem.physics.rotations import quaternion_from_rotation_vector
 from crazyem.recordings.recording import Recording
-from crazyem.simulators.constants import Constants, from_vehicle, to_vehicle, without_effects
-from crazyem.simulators.cost import HORIZON, errors_after, flown, reference_flight, rms_distance, said, to_json
+from crazyem.simulators.constants import Constants, from_vehicle, impossible, objection, to_vehicle, without_effects
 from crazyem.simulators.fields import Contradiction, Format, SimulatorFile, read, write
 from crazyem.simulators.formats.rotorpy import ROTORPY, ROTORPY_JSON
-from crazyem.simulators.plausible import impossible, objection
-from crazyem.simulators.registry import FORMATS, OWN, format_named, format_of
-from crazyem.vehicle import Vehicle, preset_names
+from crazyem.vehicle import GRAVITY, Vehicle, preset_names
+
+Array = NDArray[np.float64]
+HORIZON = 0.5  # s
+STARTS, SPACING, STEP = 100, 0.1, 0.01  # starts; s from one to the next; s between commands
+SPEED, TILT, RATE = 1.5, math.radians(15.0), 1.0  # m/s, rad, rad/s: largest values of the synthetic flight
+STIR = 0.04  # amplitude of the rotor commands around hover, relative to hover thrust
+NOTHING = 1e-9  # smaller distances are rounding errors and shown as 0
+_COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Starts and inputs. state (n, 13) as `predict.NAMES`; times (n, k) s."""
+
+    inputs: Inputs
+    state: Array
+    times: Array
+
+
+def reference_flight(vehicle: Vehicle) -> Reference:
+    """The synthetic flight of a vehicle: thrust commands around hover."""
+    count = round((STARTS * SPACING + 2.0 * HORIZON) / STEP)
+    time = np.arange(count) * STEP
+    # incommensurable frequencies [Hz], so that all starts differ
+    waves = [np.sin(2.0 * np.pi * (f * time + k / 4.0)) for k, f in enumerate((0.83, 1.31, 1.97, 2.71))]
+    stir = np.stack(waves, axis=1)
+    thrust = vehicle.mass * GRAVITY / 4.0 * (1.0 + STIR * stir)
+    rotor = RotorInput(time, np.ascontiguousarray(thrust), np.full(count, 3.85), time, measured=False, aged=False)
+    begin = HORIZON + SPACING * np.arange(STARTS)
+    phase = begin[:, None] * np.array([0.37, 0.53, 0.71])
+    velocity = SPEED / math.sqrt(3.0) * np.sin(2.0 * np.pi * phase)
+    turn = TILT * np.column_stack([np.sin(2.0 * np.pi * 0.61 * begin), np.cos(2.0 * np.pi * 0.43 * begin), 0.0 * begin])
+    rate = RATE * np.sin(2.0 * np.pi * (phase[:, ::-1] + 0.2))
+    attitude = quaternion_from_rotation_vector(turn)
+    position = np.tile([0.0, 0.0, 2.0], (STARTS, 1))
+    state = np.concatenate([position, velocity, attitude, rate], axis=1)
+    inputs = Inputs(rotor, "motor_command", vehicle, (), 0.0, 0.0)
+    return Reference(inputs, state, begin[:, None] + np.arange(0.0, HORIZON + STEP / 2, STEP))
+
+
+def flown(reference: Reference, vehicle: Vehicle) -> Array:
+    """(n, k, 13) predicted states of a vehicle from every start."""
+    return Simulator(reference.inputs, vehicle=vehicle).run(reference.state, reference.times)
+
+
+def rms_distance(first: Array, second: Array) -> dict[str, float]:
+    """Root mean square distance of two predictions at their last moments, by quantity [m, m/s, rad, rad/s]."""
+    found = {}
+    for name, columns in _COLUMNS.items():
+        length = lengths(first[:, -1, columns], second[:, -1, columns], attitude=name == "attitude")
+        found[name] = float(np.sqrt(np.mean(np.square(length)))) if np.isfinite(length).all() else math.inf
+    return found
+
+
+def errors_after(recording: Recording, vehicles: Mapping[str, Vehicle]) -> dict[str, dict[str, float]]:
+    """Open-loop errors after half a second along a recording, by vehicle and quantity.
+
+    Raises: DataError if the recording has no whole states or no flight that is long enough.
+    """
+    found: dict[str, dict[str, float]] = {}
+    at = None
+    for name, vehicle in vehicles.items():
+        shown = recorded(recording, vehicle)
+        at = windows(shown, horizons=(HORIZON,)) if at is None else at
+        length = error_lengths(open_loop(shown, at), at)
+        found[name] = {q: float(np.sqrt(np.nanmean(np.square(v[:, -1])))) for q, v in length.items()}
+    return found
+
+
+def said(errors: Mapping[str, float]) -> str:
+    """Distances for people."""
+    return ", ".join(f"{errors[q] if abs(errors[q]) > NOTHING else 0.0:.2g} {unit}" for q, unit in UNITS.items())
+
+
+OWN = "crazyem"  # a vehicle file
+
+
+def discover(paths: Iterable[str], package: str = "") -> dict[str, Format]:
+    """Every `Format` in the modules of some folders, sorted by `order` and name.
+
+    Args:
+        paths: folders.
+        package: dotted name of the package of these folders; empty: top level.
+    """
+    modules = pkgutil.iter_modules(list(paths), f"{package}." if package else "")
+    found = [v for m in modules for v in vars(importlib.import_module(m.name)).values() if isinstance(v, Format)]
+    return {form.name: form for form in sorted(found, key=lambda form: (form.order, form.name))}
+
+
+_FOLDER = importlib.import_module("crazyem.simulators.formats")
+FORMATS = discover(_FOLDER.__path__, _FOLDER.__name__)
+NAMES = (*(n for n in FORMATS if n != ROTORPY_JSON.name), OWN)
+
+
+def format_named(name: str) -> Format:
+    """A format by its name. Raises UsageError for an unknown one."""
+    if name not in FORMATS:
+        raise UsageError(f"unknown format '{name}' (known: {', '.join(NAMES)}).")
+    return FORMATS[name]
+
+
+def format_of(text: str, *, where: str) -> str:
+    """The name of a text's format, `OWN` for a vehicle file.
+
+    Raises: FileFormatError if no format fits.
+    """
+    for form in FORMATS.values():
+        if form.recognises(text):
+            return form.name
+    if "cmd_f_coef" in text or "rpy_coef" in text:
+        raise FileFormatError(
+            f"{where}: a fitted closed-loop model of crazyflow holds no physical constants; fit it to flights instead"
+        )
+    if "thrust2torque" in text and "mass_thrust" in text:
+        raise FileFormatError(f"{where}: gains of crazyflow's controller, not constants of a drone")
+    if any(line.split("=")[0].strip() == "mass" for line in text.splitlines()) and "inertia" in text:
+        return OWN
+    raise FileFormatError(f"{where}: no file of a known simulator ({', '.join(NAMES)})")
+
 
 # Quantities that a file holds or omits together: words for people, and the quantities.
 GROUPS: tuple[tuple[str, tuple[str, ...]], ...] = (
@@ -68,9 +204,9 @@ class Omission:
     def to_json(self) -> dict[str, Any]:
         """For programs."""
         found: dict[str, Any] = {"name": self.name, "words": self.words, "why": self.why, "horizon_s": HORIZON}
-        found["cost"] = None if self.cost is None else to_json(self.cost)
+        found["cost"] = finite(self.cost)  # None where a model left the range of numbers
         if self.errors is not None:
-            found["errors"] = {k: to_json(v) for k, v in self.errors.items()}
+            found["errors"] = finite(self.errors)
         return found
 
 

@@ -17,10 +17,9 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.rotors import THRUST_SCALE, TRIM
 from crazyem.physics.effects.timing import LAG_SD, MOTOR_LAG
 from crazyem.physics.motion import vehicle_values
-from crazyem.simulators.constants import NUMBERS, from_vehicle
+from crazyem.simulators.constants import NUMBERS, from_vehicle, impossible
 from crazyem.simulators.findings import rescaled
-from crazyem.simulators.plausible import impossible
-from crazyem.vehicle import Posterior, Vehicle
+from crazyem.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 MASS_SD = 0.02  # relative: other batteries, decks or markers that were not weighed
@@ -71,7 +70,10 @@ def sample(
     posterior = vehicle.posterior
     if posterior is None:
         raise UsageError(f"vehicle {vehicle.name} has no [posterior]; diagnose --write-vehicle writes one.")
-    _check(posterior, vehicle)
+    for key in posterior.parameters:
+        effect, _, name = key.partition(".")
+        if effect not in CATALOGUE or name not in {p.name for p in CATALOGUE[effect].parameters}:
+            raise UsageError(f"vehicle {vehicle.name}: its [posterior] has an unknown parameter '{key}'.")
     rng = np.random.default_rng(seed)
     variances, directions = np.linalg.eigh(np.array(posterior.covariance, float))
     root = directions * np.sqrt(np.maximum(variances, 0.0))
@@ -94,13 +96,6 @@ def sample(
         vehicles.append(drawn)
         draws.append(theta)
     return VehicleSample(tuple(vehicles), posterior.parameters, np.array(draws), seed)
-
-
-def _check(posterior: Posterior, vehicle: Vehicle) -> None:
-    for key in posterior.parameters:
-        effect, _, name = key.partition(".")
-        if effect not in CATALOGUE or name not in {p.name for p in CATALOGUE[effect].parameters}:
-            raise UsageError(f"vehicle {vehicle.name}: its [posterior] has an unknown parameter '{key}'.")
 
 
 def _drawn(vehicle: Vehicle, parameters: Sequence[str], theta: Array) -> Vehicle:

@@ -8,8 +8,9 @@ from types import SimpleNamespace
 
 from crazyem.errors import LinkError
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
-from crazyem.links.base import Block, LinkLost, LinkStatistics, Packet, ParameterWrite, Variable
+from crazyem.links.base import LinkLost, LinkStatistics, ParameterWrite
 from crazyem.live.telemetry import ARMED, AUTO_ARM, CAN_ARM, CAN_FLY, FLYING
+from crazyem.signals.sample import Block, Packet, Variable
 from crazyem.signals.vocabulary import (
     EXTRA_VARIABLES,
     MOTOR_BLOCK,
@@ -139,16 +140,14 @@ class FakeLink:
         if not self.low_level:
             self.wanted, self._landing = (*self.wanted[:2], height), True
 
-    def go_to(self, *a, **k):
-        raise AssertionError
-
     def send_full_state(self, position, velocity, acceleration, quaternion, body_rate):
         self.calls.append("setpoint")
         if self.lost_at is not None and self.fm > self.lost_at:
             raise LinkError("gone")
         self.low_level, self.wanted, self.last_setpoint = True, tuple(position), self.fm
 
-    send_position = send_hover = go_to
+    def send_position(self, *a, **k):
+        raise AssertionError
 
     def release_setpoints(self):
         self.calls.append("release")

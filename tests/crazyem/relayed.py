@@ -7,8 +7,8 @@ import contextlib
 import threading
 import time
 
-from crazyem.links.base import Packet
 from crazyem.links.crazyflie import CrazyflieLink
+from crazyem.signals.sample import Packet
 from firmware_sim.relay.faults import Engine, Fault
 from firmware_sim.relay.relay import Relay, parse_target
 

@@ -10,10 +10,10 @@ from mavlink_pilot import free_port
 from recording_files import fails
 
 from crazyem.cli import main, parser
-from crazyem.commands.common import compile_kernels
+from crazyem.commands.output import compile_kernels
 from crazyem.control.named_trajectories import trajectory_maker
 from crazyem.errors import UsageError
-from crazyem.live import warm_up
+from crazyem.live import runner
 from crazyem.vehicle import load_vehicle
 
 
@@ -160,7 +160,7 @@ def test_whole_periods_are_told_in_one_line():
 def test_a_plot_is_written_only_beside_a_file_that_was_asked_for():
     from argparse import Namespace
 
-    from crazyem.commands.common import plot_path
+    from crazyem.commands.output import plot_path
 
     assert plot_path(Namespace(plot=None), None, None) is None
     assert plot_path(Namespace(plot=None), None, "-") is None
@@ -173,16 +173,16 @@ def test_a_plot_is_written_only_beside_a_file_that_was_asked_for():
 
 def test_a_start_from_the_disk_says_nothing_however_slow(monkeypatch, capsys) -> None:
     vehicle = load_vehicle("cf2")
-    warm_up.warm_up(vehicle)
+    runner.warm_up(vehicle)
     clock = iter((0.0, 60.0))
-    monkeypatch.setattr(warm_up, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    monkeypatch.setattr(runner, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     compile_kernels(vehicle)
     assert "compiled" not in "".join(capsys.readouterr())
 
 
 def test_a_compilation_is_told(monkeypatch, capsys) -> None:
     counts = iter((0, 3))
-    monkeypatch.setattr(warm_up, "compilations", lambda: next(counts))
+    monkeypatch.setattr(runner, "compilations", lambda: next(counts))
     compile_kernels(load_vehicle("cf2"))
     assert "compiled the estimator in" in "".join(capsys.readouterr())
 

@@ -15,11 +15,11 @@ from scipy.signal import butter, tf2ss
 from crazyem.control.command_units import LOOP, effectiveness_torque, lag_share, rotor_reaction_factor
 from crazyem.estimation.result import Estimate
 from crazyem.estimation.verdict import NOT_CONVERGED
-from crazyem.live.beliefs import Slot
 from crazyem.live.controllers import (
     INDI,
     LEE,
     MELLINGER,
+    Slot,
     for_vehicle,
     with_drag,
     writes_back,

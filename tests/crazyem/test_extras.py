@@ -12,8 +12,8 @@ import pytest
 import crazyem
 from crazyem import extras
 from crazyem.commands.batch import each
-from crazyem.commands.common import plot_path
-from crazyem.commands.view import wants_view
+from crazyem.commands.flights import wants_view
+from crazyem.commands.output import plot_path
 from crazyem.diagnosis.report import Series, html, write_report
 from crazyem.live.foxglove import sdk
 from crazyem.paper.figures import draw_all

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from crazyem.links.base import Block, Packet, ParameterWrite, Variable
+from crazyem.links.base import ParameterWrite
 from crazyem.recordings.mcap.writer import RecordingWriter
+from crazyem.signals.sample import Block, Packet, Variable
 from crazyem.vehicle import load_vehicle
 from firmware_sim.relay.faults import UP, Fault
 from firmware_sim.scenario import parse_scenario

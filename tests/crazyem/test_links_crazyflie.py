@@ -53,10 +53,8 @@ def test_lost_echoes_leave_the_write_unverified_and_the_link_usable(fake_peer):
         write = link.write_parameter("ctrlLee.mass", 0.034, timeout=0.4)
         assert not write.verified
         assert write.echoed is None
-        assert "did not confirm ctrlLee.mass" in link.parameter_fault
         fake_peer.lose = lambda request: False
         assert link.write_parameter("ctrlLee.mass", 0.035).verified
-        assert link.parameter_fault == ""
 
 
 def test_an_echo_with_another_value_is_not_a_confirmation(fake_peer):
@@ -235,7 +233,7 @@ def test_standard_blocks_stream_at_100_hz(resting):
 
 def test_a_second_client_can_take_off_after_the_first_has_commanded(resting):
     with CrazyflieLink(resting.uri) as first:
-        first.send_hover(0.0, 0.0, 0.0, 0.0)
+        first.send_position(0.0, 0.0, 0.0, 0.0)
     with CrazyflieLink(resting.uri) as second:
         blocks = second.subscribe(["stateEstimate.x", "stateEstimate.y", "stateEstimate.z"], 50.0)
         second.take_off(0.5, 1.0)

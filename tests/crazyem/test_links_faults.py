@@ -12,10 +12,10 @@ from fake_peer import FakePeer
 from relayed import connected, down, now_on, packets, relayed, take, up, wait_for
 
 from crazyem.errors import LinkError, UsageError
-from crazyem.links.base import LinkLost, Packet
-from crazyem.links.connection import _Progress, new_crazyflie
-from crazyem.links.reconnection import Reconnector
+from crazyem.links.base import LinkLost
+from crazyem.links.connection import Reconnector, _Progress, new_crazyflie
 from crazyem.live.session import LOG_RATE
+from crazyem.signals.sample import Packet
 from crazyem.signals.vocabulary import STATE_VARIABLES, standard_variables
 
 SILENT_AFTER = "crazyem.links.crazyflie.SILENT_AFTER"

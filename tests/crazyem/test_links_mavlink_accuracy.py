@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from crazyem.estimation.online import ATTITUDE_PERIOD, OnlineEstimator
 from crazyem.links.mavlink import streams
 from crazyem.links.mavlink.frames import FrameParser
-from crazyem.links.mavlink.stamps import DroneClock
+from crazyem.links.mavlink.receiver import DroneClock
 from crazyem.signals.sample import Packet
 from crazyem.signals.vocabulary import decoders
 from crazyem.vehicle import load_vehicle

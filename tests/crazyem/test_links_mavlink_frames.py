@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from crazyem.errors import UsageError
 from crazyem.links.mavlink import parameters
 from crazyem.links.mavlink.frames import FrameParser, SequenceCounter, checksum, definitions, number_of
-from crazyem.links.mavlink.stamps import DroneClock, RestartedError
+from crazyem.links.mavlink.receiver import DroneClock, RestartedError
 from crazyem.links.mavlink.transport import Address, parse
 
 

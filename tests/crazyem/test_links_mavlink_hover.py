@@ -14,15 +14,14 @@ from crazyem.errors import LinkError, UsageError
 from crazyem.estimation.result import Estimate, ParameterEstimate
 from crazyem.live.controllers import writes_back
 from crazyem.live.guard import Guard
-from crazyem.live.hover_thrust import (
+from crazyem.live.policy import WriteRules, load_policy
+from crazyem.live.push import (
     HIGHEST_HOVER_THRUST,
     LOWEST_HOVER_THRUST,
     hover_afterwards,
     hover_rules,
     hover_target,
 )
-from crazyem.live.policy import load_policy
-from crazyem.live.write_supervisor import WriteRules
 from crazyem.vehicle import load_vehicle
 
 CF2 = load_vehicle("cf2")

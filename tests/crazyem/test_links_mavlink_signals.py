@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.links.mavlink import streams
 from crazyem.links.mavlink.frames import FrameParser, definitions
-from crazyem.links.mavlink.motors import ARDUPILOT, PX4, Outputs
+from crazyem.links.mavlink.streams import ARDUPILOT, PX4, Outputs
 from crazyem.recordings import open_recording
 from crazyem.signals.mavlink import MAPPINGS, mapping
 from crazyem.signals.sample import Packet

@@ -17,7 +17,7 @@ from crazyem.links.base import AnotherDroneError, LinkLost, LinkStatistics, Outa
 from crazyem.links.crazyflie import CrazyflieLink
 from crazyem.live.controllers import LEE
 from crazyem.live.flight import Flight, FlightPlan
-from crazyem.live.recorder import open_recorder
+from crazyem.live.history import open_recorder
 from crazyem.live.scheduler import Scheduler
 from crazyem.live.session import Session
 from crazyem.recordings import open_recording

@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from crazyem.live import dashboard
-from crazyem.live.dashboard import BARS, Dashboard, picture, sparkline
-from crazyem.live.keys import Keys
+from crazyem.live.dashboard import BARS, Dashboard, Keys, picture, sparkline
 from crazyem.live.session import Session
 from crazyem.live.views import LinkView, Observer, ParameterView, SessionControls, Snapshot
 from crazyem.vehicle import load_vehicle

@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from crazyem.live.keys import Keys
+from crazyem.live.dashboard import Keys
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def test_a_terminal_that_hangs_up_ends_the_keys_once(terminal):
 CHILD = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from crazyem.live.keys import Keys
+from crazyem.live.dashboard import Keys
 keys = Keys(0)
 keys.begin()
 print("ready", flush=True)

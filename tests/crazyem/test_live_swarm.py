@@ -14,8 +14,8 @@ from fake_drone import FakeEstimator, FakeLink
 from rich.console import Console
 
 from crazyem.cli import main, parser
+from crazyem.commands import flights
 from crazyem.commands import swarm as command
-from crazyem.commands import view
 from crazyem.errors import CrazyemError, DataError, LinkError, UsageError
 from crazyem.live import flight, runner
 from crazyem.live.flight import Flight, Interrupts
@@ -141,7 +141,7 @@ def test_an_offset_is_where_the_trajectory_is_flown(fake, tmp_path):
 
 def test_landing_by_key_never_cuts_and_control_c_after_it_does_not_either():
     ones = [Interrupts(), Interrupts()]
-    everyone = view.SwarmInterrupts(ones)
+    everyone = flights.SwarmInterrupts(ones)
     for _ in range(3):
         ones[0].land()
     assert [o.count for o in ones] == [1, 0]
@@ -192,12 +192,12 @@ def test_the_table_shows_what_is_not_known():
 )  # fmt: skip
 def test_a_live_view_is_for_terminals(monkeypatch, given, out, err, expected):
     streams = {"stdout": SimpleNamespace(isatty=lambda: out), "stderr": SimpleNamespace(isatty=lambda: err)}
-    monkeypatch.setattr(view, "sys", SimpleNamespace(**streams))
+    monkeypatch.setattr(flights, "sys", SimpleNamespace(**streams))
     monkeypatch.setenv("TERM", "dumb")
     if given != ["--live"]:
-        assert view.wants_view(parser().parse_args(["fly", *given])) is False
+        assert flights.wants_view(parser().parse_args(["fly", *given])) is False
     monkeypatch.setenv("TERM", "xterm")
-    assert view.wants_view(parser().parse_args(["fly", *given])) is expected
+    assert flights.wants_view(parser().parse_args(["fly", *given])) is expected
 
 
 def test_the_view_takes_the_place_of_the_lines_and_leaves_the_summary(fake, monkeypatch, capsys):
@@ -220,10 +220,10 @@ def test_the_view_takes_the_place_of_the_lines_and_leaves_the_summary(fake, monk
 
 
 def test_live_and_confirm_do_not_go_together(monkeypatch):
-    monkeypatch.setattr(view, "_terminal", lambda stream: True)
+    monkeypatch.setattr(flights, "_terminal", lambda stream: True)
     monkeypatch.setenv("TERM", "xterm")
     with pytest.raises(UsageError, match="plain lines"):
-        view.wants_view(parser().parse_args(["fly", "--live", "--confirm"]))
+        flights.wants_view(parser().parse_args(["fly", "--live", "--confirm"]))
 
 
 def test_errors_of_one_drone_keep_their_exit_code():

@@ -8,7 +8,7 @@ import synthetic
 from fake_drone import until
 
 from crazyem.estimation.online import OnlineEstimator
-from crazyem.live.scheduler import LONGEST_DEFERRAL, TIME_SLICE, Scheduler, UpdateThrottle
+from crazyem.live.scheduler import LONGEST_DEFERRAL, TIME_SLICE, Mailbox, Scheduler, UpdateThrottle
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle
 
@@ -37,7 +37,7 @@ def test_items_of_a_mailbox_are_worked_off_in_order_and_one_at_a_time(scheduler)
 
         return work
 
-    boxes = {i: scheduler.mailbox(worker(i), lambda e: None) for i in done}
+    boxes = {i: Mailbox(scheduler, worker(i), lambda e: None) for i in done}
     for item in range(200):
         for box in boxes.values():
             box.put(item)
@@ -66,7 +66,7 @@ def test_a_mailbox_that_fails_ends_alone(scheduler):
     def fails(item):
         raise ValueError(f"item {item}")
 
-    bad, good = scheduler.mailbox(fails, errors.append), scheduler.mailbox(done.append, errors.append)
+    bad, good = Mailbox(scheduler, fails, errors.append), Mailbox(scheduler, done.append, errors.append)
     for item in range(3):
         bad.put(item)
         good.put(item)
@@ -86,8 +86,8 @@ def test_a_busy_drone_does_not_starve_the_others():
         time.sleep(TIME_SLICE / 2)
         done.append(item)
 
-    slow = one.mailbox(work, lambda e: None)
-    quick = one.mailbox(done.append, lambda e: None)
+    slow = Mailbox(one, work, lambda e: None)
+    quick = Mailbox(one, done.append, lambda e: None)
     for item in range(30):
         slow.put(item)
     quick.put("now")

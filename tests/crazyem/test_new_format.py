@@ -9,8 +9,7 @@ import pytest
 from crazyem.physics import folding
 from crazyem.recordings import registry as recordings
 from crazyem.recordings.registry import Reader, open_recording
-from crazyem.simulators import registry as simulators
-from crazyem.simulators.convert import convert, load_source
+from crazyem.simulators.convert import FORMATS, convert, discover, load_source
 
 RECORDING_FORMAT = '''
 """Text of a made-up logger: a line of "logger 1", then time, x, y, z."""
@@ -64,10 +63,10 @@ def test_a_format_of_recordings_is_one_file(tmp_path: Path, monkeypatch: pytest.
 def test_a_format_of_simulators_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "made_up_format_of_a_test.py").write_text(SIMULATOR_FORMAT)
     monkeypatch.syspath_prepend(tmp_path)
-    found = simulators.discover([str(tmp_path)])
+    found = discover([str(tmp_path)])
     sys.modules.pop("made_up_format_of_a_test")
     assert list(found) == ["made-up"]
-    monkeypatch.setitem(simulators.FORMATS, "made-up", found["made-up"])
+    monkeypatch.setitem(FORMATS, "made-up", found["made-up"])
     drone = folding.load("cf21bl")
     made = convert(drone, "made-up", costs=False)
     path = tmp_path / "drone.toml"

@@ -16,10 +16,9 @@ from made_paper import BOUND, TRUE, offline, online, results_of, table1, whole_r
 
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.paper.experiments import short, window_ends
-from crazyem.paper.pages import index_html, tables_markdown
+from crazyem.paper.pages import Grid, grids, index_html, tables_markdown
 from crazyem.paper.published_values import FIGURES, PARAMETERS, PUBLISHED_RANGES, SENSORS, TABLE_I
 from crazyem.paper.settings import Settings
-from crazyem.paper.table_text import Grid, grids
 from crazyem.paper.tables import cell, derive, expected_range, flights
 
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -12,9 +12,8 @@ from simulator_files import DRONE, PUBLISHED
 
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.simulators.constants import NUMBERS, Constants, from_vehicle, to_vehicle
-from crazyem.simulators.convert import convert
+from crazyem.simulators.convert import FORMATS, NAMES, OWN, convert, format_of
 from crazyem.simulators.fields import SimulatorFile, read, write
-from crazyem.simulators.registry import FORMATS, NAMES, OWN, format_of
 from crazyem.vehicle import Vehicle, load_vehicle
 
 RPM = 60.0 / (2.0 * math.pi)

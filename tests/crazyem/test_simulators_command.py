@@ -16,11 +16,17 @@ from crazyem.api.vehicles import check_vehicle, disagreements
 from crazyem.cli import main
 from crazyem.diagnosis.compare import compare
 from crazyem.recordings import open_recording
-from crazyem.simulators.convert import convert, load_source
-from crazyem.simulators.cost import errors_after, flown, reference_flight, rms_distance
+from crazyem.simulators.convert import (
+    FORMATS,
+    convert,
+    errors_after,
+    flown,
+    load_source,
+    reference_flight,
+    rms_distance,
+)
 from crazyem.simulators.fields import SimulatorFile, read
 from crazyem.simulators.findings import alternatives, field_findings, rescaled
-from crazyem.simulators.registry import FORMATS
 from crazyem.simulators.sampling import sample
 from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
 

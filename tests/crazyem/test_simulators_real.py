@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from crazyem.physics.rotors import wrench
-from crazyem.simulators.convert import Conversion, convert
-from crazyem.simulators.cost import HORIZON, STEP, Reference, flown, reference_flight
+from crazyem.simulators.convert import HORIZON, STEP, Conversion, Reference, convert, flown, reference_flight
 from crazyem.vehicle import Vehicle
 
 pytestmark = [

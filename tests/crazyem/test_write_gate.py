@@ -16,13 +16,11 @@ from crazyem.live.attach import Attachment
 from crazyem.live.controllers import LEE
 from crazyem.live.guard import Decision, Guard
 from crazyem.live.history import History
-from crazyem.live.policy import EndRules, Policy
+from crazyem.live.policy import EndRules, Policy, WriteRules
 from crazyem.live.push import Pusher
 from crazyem.live.session import Session
-from crazyem.live.telemetry import FLYING, Telemetry
-from crazyem.live.write_gate import FRESH_TELEMETRY_SECONDS as FRESH
-from crazyem.live.write_gate import WriteGate
-from crazyem.live.write_supervisor import WriteRules
+from crazyem.live.telemetry import FLYING, Telemetry, WriteGate
+from crazyem.live.telemetry import FRESH_TELEMETRY_SECONDS as FRESH
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import load_vehicle
 

@@ -134,7 +134,8 @@ class FrameParser:
         found: list[Frame] = []
         at = 0
         while at < len(data):
-            start = _mark(data, at)
+            places = [p for p in (data.find(b"\xfd", at), data.find(b"\xfe", at)) if p >= 0]
+            start = min(places, default=len(data))  # where the next frame may begin
             self.skipped += start - at
             at = start
             if at == len(data):
@@ -170,12 +171,6 @@ class FrameParser:
             return 1  # another frame may begin inside the damaged one
         found.append(Frame(system, component, number, sequence, data[start:end], data[at:after]))
         return after - at
-
-
-def _mark(data: bytes, at: int) -> int:
-    """The next position at which a frame may begin, len(data) if there is none."""
-    places = [p for p in (data.find(b"\xfd", at), data.find(b"\xfe", at)) if p >= 0]
-    return min(places, default=len(data))
 
 
 _REPEAT_MEMORY = 64  # newest frames in which repetitions are recognised

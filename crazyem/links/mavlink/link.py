@@ -11,21 +11,20 @@ from collections.abc import Callable, Mapping, Sequence
 from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import AnotherDroneError, LinkLost, LinkStatistics, Outage, ParameterWrite
 from crazyem.links.clock import ClockFit
-from crazyem.links.mavlink import motors, streams
+from crazyem.links.mavlink import streams
 from crazyem.links.mavlink.frames import number_of
 from crazyem.links.mavlink.parameters import ParameterClient
 from crazyem.links.mavlink.receiver import Receiver
-from crazyem.links.mavlink.sender import ACCEPTED, MessageSender
-from crazyem.links.mavlink.transport import open_transport, parse
+from crazyem.links.mavlink.transport import ACCEPTED, MessageSender, open_transport, parse
 from crazyem.signals.sample import Block, Packet
 
 # s of listening after the request for streams; the same at most, if messages are missing
 _LISTEN_SECONDS, _LONGEST_LISTEN_SECONDS = 0.7, 5.0
-HOVER_PARAMETERS = {motors.PX4: "MPC_THR_HOVER", motors.ARDUPILOT: "MOT_THST_HOVER"}
+HOVER_PARAMETERS = {streams.PX4: "MPC_THR_HOVER", streams.ARDUPILOT: "MOT_THST_HOVER"}
 # onboard estimator of hover thrust: its parameter, the value if it is on, a description
 ONBOARD_HOVER_ESTIMATORS = {
-    motors.PX4: ("MPC_USE_HTE", 1.0, "PX4 flies with its own estimate of hover thrust"),
-    motors.ARDUPILOT: ("MOT_HOVER_LEARN", 2.0, "ArduPilot learns and saves hover thrust itself"),
+    streams.PX4: ("MPC_USE_HTE", 1.0, "PX4 flies with its own estimate of hover thrust"),
+    streams.ARDUPILOT: ("MOT_HOVER_LEARN", 2.0, "ArduPilot learns and saves hover thrust itself"),
 }
 
 
@@ -45,7 +44,7 @@ class MavlinkLink:
         self.uri = uri
         self.address = parse(uri)
         self.packets: queue.SimpleQueue[Packet | LinkLost] = queue.SimpleQueue()
-        self.outputs = motors.Outputs()
+        self.outputs = streams.Outputs()
         self._receiver: Receiver | None = None
         self._reconnecting = False
         self._rate = 0.0
@@ -53,7 +52,7 @@ class MavlinkLink:
             uri,
             ask_read=lambda name: self._talk().ask_parameter(name),
             ask_write=lambda name, value, kind: self._talk().set_parameter(name, value, kind),
-            bitwise=lambda: self.autopilot == motors.PX4,
+            bitwise=lambda: self.autopilot == streams.PX4,
         )
 
     # --- connection ---------------------------------------------------------------------------------------------
@@ -84,7 +83,7 @@ class MavlinkLink:
         return f"no heartbeat of {chosen} came at {self.uri} within {timeout:g} s.{others}{noise}"
 
     def _identify(self, receiver: Receiver) -> None:
-        wanted = list(motors.wanted(receiver.autopilot))
+        wanted = list(streams.wanted(receiver.autopilot))
         if receiver.autopilot in HOVER_PARAMETERS:
             wanted += [HOVER_PARAMETERS[receiver.autopilot], ONBOARD_HOVER_ESTIMATORS[receiver.autopilot][0]]
 
@@ -99,7 +98,7 @@ class MavlinkLink:
                     receiver.sender.ask_parameter(name)
             if self._wait(complete, 0.3 * (attempt + 1)):
                 break
-        self.outputs = receiver.streams.outputs = motors.Outputs.of(receiver.autopilot, self._parameters.known)
+        self.outputs = receiver.streams.outputs = streams.Outputs.of(receiver.autopilot, self._parameters.known)
 
     def close(self) -> None:
         """Stop listening and close the connection. The requested streams go on."""
@@ -175,7 +174,7 @@ class MavlinkLink:
         )
         if missing := _missing(receiver.seen):
             raise LinkError(f"the drone at {self.uri} sends no {' and no '.join(missing)}.")
-        names = receiver.streams.choose(set(receiver.seen), raw_imu=receiver.autopilot == motors.ARDUPILOT)
+        names = receiver.streams.choose(set(receiver.seen), raw_imu=receiver.autopilot == streams.ARDUPILOT)
         blocks = streams.blocks_of(names, rate_hz)
         receiver.use(blocks)
         return tuple(blocks.values())
@@ -263,11 +262,6 @@ class MavlinkLink:
         return self._parameters.types()
 
     @property
-    def parameter_fault(self) -> str:
-        """Why the last parameter access had no answer; "" if parameters work."""
-        return self._parameters.fault
-
-    @property
     def hover_parameter(self) -> str:
         """The hover thrust parameter of this kind of autopilot, "" if none is known."""
         return HOVER_PARAMETERS.get(self.autopilot, "")
@@ -314,9 +308,7 @@ class MavlinkLink:
     def _not_flown(self, *_: object, **__: object) -> None:
         raise UsageError("a MAVLink drone is watched, not flown: fly it with its own ground station.")
 
-    arm = take_off = land = go_to = _not_flown
-    send_full_state = send_position = send_hover = _not_flown
-    release_setpoints = stop = _not_flown
+    arm = take_off = land = send_full_state = send_position = release_setpoints = stop = _not_flown
 
 
 def _missing(seen: Mapping[str, int]) -> list[str]:

@@ -68,7 +68,6 @@ class ParameterClient:
         self._replies: queue.SimpleQueue[tuple[float, int]] = queue.SimpleQueue()
         self._waiting = ""
         self._lock = threading.Lock()
-        self.fault = ""
 
     @property
     def known(self) -> Mapping[str, float]:
@@ -94,10 +93,8 @@ class ParameterClient:
         """The present value in the drone. Raises LinkError: no answer (some autopilots ignore unknown names)."""
         with self._lock:
             for value, kind in self._replies_to(name, lambda: self._ask_read(name), timeout):
-                self.fault = ""
                 return decode(value, kind, bitwise=self._bitwise())
-        self.fault = f"The drone at {self._uri} did not answer a read of {name} within {timeout:g} s."
-        raise LinkError(self.fault)
+        raise LinkError(f"The drone at {self._uri} did not answer a read of {name} within {timeout:g} s.")
 
     def write(self, name: str, value: float, timeout: float) -> ParameterWrite:
         """Write and wait for the echo: `verified` only if the drone sends back exactly the written bits.
@@ -118,10 +115,7 @@ class ParameterClient:
                 echoed = decode(echo, echo_kind, bitwise=bitwise)
                 # An echo with another value belongs to an earlier write: keep waiting for ours.
                 if echo_kind == kind and struct.pack("<f", echo) == struct.pack("<f", wire):
-                    self.fault = ""
                     return ParameterWrite(name, value, echoed, True, time.time())
-        said = f"answered {name} = {value:g} with {echoed:g}" if echoed is not None else f"did not confirm {name}"
-        self.fault = f"The drone at {self._uri} {said} within {timeout:g} s."
         return ParameterWrite(name, value, echoed, False, time.time())
 
     def _replies_to(self, name: str, request: Callable[[], object], timeout: float) -> Iterator[tuple[float, int]]:

@@ -54,14 +54,11 @@ class LiteralDocument(Spliced):
                 name = statement.targets[0].id
                 if isinstance(value, ast.Dict):
                     self.root[name] = value
-                else:
-                    self._remember(name, statement.value)
-
-    def _remember(self, name: str, node: ast.expr) -> None:
-        try:
-            self._names[name] = self._value(node)
-        except UnknownError:
-            self._names.pop(name, None)
+                    continue
+                try:
+                    self._names[name] = self._value(statement.value)
+                except UnknownError:
+                    self._names.pop(name, None)
 
     def keys(self, path: Path) -> list[str]:
         """Keys of the dict at a path (its first step is the name of an assignment, "" of JSON)."""

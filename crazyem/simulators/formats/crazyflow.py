@@ -8,10 +8,9 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from crazyem.simulators.constants import Constants, hover_speed
+from crazyem.simulators.constants import RPM, Constants, hover_speed
 from crazyem.simulators.documents.tables import TomlDocument
 from crazyem.simulators.fields import Field, Format, template
-from crazyem.simulators.plausible import RPM
 from crazyem.vehicle import GRAVITY
 
 _AXES = "xyz"

@@ -13,8 +13,7 @@ from crazyem.errors import FileFormatError
 from crazyem.physics.effects.mass_properties import steiner
 from crazyem.simulators.constants import Constants, inertia_of
 from crazyem.simulators.documents.xml import Element, XmlDocument
-from crazyem.simulators.fields import Field, Format, template
-from crazyem.simulators.layout import NOTHING
+from crazyem.simulators.fields import NOTHING, Field, Format, template
 
 Array = NDArray[np.float64]
 _ELEMENTS = (("ixx", 0, 0), ("iyy", 1, 1), ("izz", 2, 2), ("ixy", 0, 1), ("ixz", 0, 2), ("iyz", 1, 2))

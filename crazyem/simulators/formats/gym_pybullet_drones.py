@@ -7,9 +7,8 @@ Products of inertia are not written: Bullet would turn the base frame to the pri
 from typing import Any
 
 from crazyem.simulators.documents.xml import XmlDocument
-from crazyem.simulators.fields import Field, Format, template
+from crazyem.simulators.fields import PLUS, Field, Format, template
 from crazyem.simulators.formats.crazyflow import PER_RPM2
-from crazyem.simulators.layout import PLUS
 
 _BASE = ("link[name=base_link]", "inertial")
 

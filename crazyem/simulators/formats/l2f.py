@@ -12,9 +12,8 @@ import numpy as np
 from crazyem.errors import FileFormatError
 from crazyem.simulators.constants import Constants, inertia_of
 from crazyem.simulators.documents.literal import LiteralDocument
-from crazyem.simulators.fields import AGREE, Field, Format, template
+from crazyem.simulators.fields import AGREE, Field, Format, placed, read_positions, template
 from crazyem.simulators.formats.crazyflow import speed_of
-from crazyem.simulators.layout import placed, read_positions
 from crazyem.vehicle import GRAVITY
 
 ROUNDED = 1e-4  # relative difference up to which a derived number counts as unchanged: files hold rounded numbers

@@ -8,8 +8,7 @@ import math
 from crazyem.errors import FileFormatError
 from crazyem.simulators.constants import Constants
 from crazyem.simulators.documents.tables import YamlDocument
-from crazyem.simulators.fields import Field, Format, template
-from crazyem.simulators.layout import PLUS
+from crazyem.simulators.fields import PLUS, Field, Format, template
 
 _ROTORS = ("rotor_configuration",)
 _LISTS = (

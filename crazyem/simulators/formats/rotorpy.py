@@ -11,8 +11,7 @@ import numpy as np
 from crazyem.errors import FileFormatError
 from crazyem.simulators.constants import Constants, solved
 from crazyem.simulators.documents.literal import LiteralDocument
-from crazyem.simulators.fields import Field, Format, template
-from crazyem.simulators.layout import NOTHING, placed, read_positions
+from crazyem.simulators.fields import NOTHING, Field, Format, placed, read_positions, template
 
 _ROTORS = ("r1", "r2", "r3", "r4")
 
