@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from scipy.spatial.transform import Rotation
 from crazyem.diagnosis.prediction.horizon import (
     HORIZONS,
     UNITS,
+    HorizonErrors,
+    Windows,
     errors,
-    horizon_errors,
     lengths,
     open_loop,
     windows,
@@ -28,6 +30,11 @@ from crazyem.vehicle import load_vehicle
 Array = NDArray[np.float64]
 TIMES = np.arange(0.0, 2.5, 0.01)
 FINE = np.arange(0.0, 2.5, 0.001)
+
+
+def horizon_errors(shown: Recorded, at: Windows | None = None, **model: Any) -> HorizonErrors:
+    at = windows(shown) if at is None else at
+    return errors(open_loop(shown, at, **model), at)
 
 
 @pytest.fixture(scope="module")
@@ -74,11 +81,11 @@ def test_with_the_measured_attitude_forces_are_judged_alone(flown: Recorded) -> 
 
 
 def test_runs_lie_within_the_intervals_that_are_asked_for(flown: Recorded) -> None:
-    at = windows(flown, within=[(0.2, 1.0), (1.5, 1.6)], spacing=0.05)
+    at = windows(replace(flown, flights=((0.2, 1.0), (1.5, 1.6))), spacing=0.05)
     assert at.times.min() >= 0.2
     assert at.times.max() <= 1.0 + 0.006
     with pytest.raises(DataError, match=r"no stretch of flight is long enough for 0\.5 s"):
-        windows(flown, within=[(0.2, 0.4)])
+        windows(replace(flown, flights=((0.2, 0.4),)))
 
 
 def test_rms_and_mean_are_of_the_lengths() -> None:
@@ -123,7 +130,7 @@ def test_the_numbers_of_real_flights(shared_recordings: Path) -> None:
     real = open_recording(shared_recordings / "real_firmware" / "lee_34g_mass_pushed_midflight.csv.gz")
     right = replace(load_vehicle("cf2"), mass=0.034, motor_time_constant=0.03)
     shown = recorded(real, right)
-    at = windows(shown, within=[(12.0, 29.0)])
+    at = windows(replace(shown, flights=((12.0, 29.0),)))
     good = horizon_errors(shown, at=at)
     bad = horizon_errors(shown, vehicle=replace(right, mass=0.029), at=at)
     assert good.rms["position"][1] < 0.006
