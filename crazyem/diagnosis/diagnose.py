@@ -25,7 +25,7 @@ from crazyem.diagnosis.flights.recording_nuisances import (
     with_common_floor,
 )
 from crazyem.diagnosis.locating.locate import Located, locate
-from crazyem.diagnosis.locating.place import depends_on_place, heading_by_place
+from crazyem.diagnosis.locating.place import depends_on_place, heading_by_place, pushes_away
 from crazyem.diagnosis.naming.alternatives import (
     LOAD,
     WEAKER,
@@ -128,11 +128,11 @@ def diagnose(
     before, after = _located(data, selection, say)
     place = depends_on_place(data, apart, selection.final)
     remains = unexplained(data, selection, after, apart)
-    for finding in (pull, place and place.finding, heading_by_place(data, apart)):
+    for finding in (pull, place, heading_by_place(data, apart)):
         remains = remains.with_finding(finding) if finding else remains
     left_out = {**chosen.left_out, **selection.left_out}
     left_out |= hidden_by_daily_variation(data, selection, chosen.candidates)
-    pulled = pull is not None or (place is not None and not place.pushed)
+    pulled = pull is not None or (place is not None and not pushes_away(place))
     beside = other_likelihoods(data, apart, selection.final, remains, wanted, left_out, pulled, say)
     if any(CATALOGUE[e.name].random for e in beside):
         remains = remains.without_force()

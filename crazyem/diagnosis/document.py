@@ -313,7 +313,7 @@ def _before_after(compared: Sequence[Compared]) -> dict[str, Any]:
     by_model = zip(*([errors(run, c.at) for run in c.runs] for c in compared), strict=True)
     found: dict[str, Any] = dict(zip(("before", "after", "vehicle"), map(_pooled, by_model), strict=False))
     lengths = [(error_lengths(c.runs[0], c.at), error_lengths(c.runs[1], c.at)) for c in compared]
-    return {**found, "worse": [w.to_json() for w in worse(lengths)]}
+    return {**found, "worse": worse(lengths)}
 
 
 def _pooled(found: Sequence[HorizonErrors]) -> dict[str, Any]:

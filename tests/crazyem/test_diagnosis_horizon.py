@@ -151,14 +151,14 @@ def test_worse_is_what_grows_by_more_than_chance_and_visibly() -> None:
     rng = np.random.default_rng(0)
     before = rng.uniform(0.5, 1.5, 400)
     grown = before * 1.1
-    assert {(w.quantity, w.horizon) for w in worse([(lengths_of(before), lengths_of(grown))])} == {
+    assert {(w["quantity"], w["horizon_s"]) for w in worse([(lengths_of(before), lengths_of(grown))])} == {
         (n, h) for n in UNITS for h in HORIZONS
     }
-    assert worse([(lengths_of(grown), lengths_of(before))]) == ()
-    assert worse([(lengths_of(before), lengths_of(before * 1.001))]) == ()  # sure, and nothing that anyone sees
-    assert worse([(lengths_of(before), lengths_of(before + rng.normal(0.0, 0.01, 400)))]) == ()
-    assert worse([(lengths_of(before[:4]), lengths_of(grown[:4]))]) == ()  # too few to know what chance does
-    assert worse([]) == ()
+    assert worse([(lengths_of(grown), lengths_of(before))]) == []
+    assert worse([(lengths_of(before), lengths_of(before * 1.001))]) == []  # sure, and nothing that anyone sees
+    assert worse([(lengths_of(before), lengths_of(before + rng.normal(0.0, 0.01, 400)))]) == []
+    assert worse([(lengths_of(before[:4]), lengths_of(grown[:4]))]) == []  # too few to know what chance does
+    assert worse([]) == []
 
 
 def test_windows_that_overlap_count_as_one() -> None:
@@ -168,7 +168,7 @@ def test_windows_that_overlap_count_as_one() -> None:
     for _ in range(300):
         change = np.repeat(rng.normal(0.0, 0.1, 30), 5)
         for one in worse([(lengths_of(np.ones(150)), lengths_of(np.sqrt(1.0 + change)))]):
-            alarms[one.horizon] += one.quantity == "position"
+            alarms[one["horizon_s"]] += one["quantity"] == "position"
     assert alarms[0.5] < 0.06 * 300 < alarms[0.1]
 
 
@@ -177,5 +177,5 @@ def test_what_leaves_the_range_of_numbers_is_worse_and_what_is_not_measured_is_n
     after["attitude"] = np.full((50, len(HORIZONS)), np.inf)
     after["velocity"] = before["velocity"] = np.full((50, len(HORIZONS)), np.nan)
     found = worse([(before, after)])
-    assert {w.quantity for w in found} == {"attitude"}
-    assert found[0].to_json() == {"quantity": "attitude", "horizon_s": 0.01, "standard_errors": None}
+    assert {w["quantity"] for w in found} == {"attitude"}
+    assert found[0] == {"quantity": "attitude", "horizon_s": 0.01, "standard_errors": None}

@@ -17,7 +17,7 @@ from crazyem.diagnosis.document import compare, text_of
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.flights.flight import without
 from crazyem.diagnosis.locating.locate import Finding
-from crazyem.diagnosis.locating.place import Place
+from crazyem.diagnosis.locating.place import pushes_away
 from crazyem.diagnosis.naming import other_likelihoods as beside
 from crazyem.diagnosis.naming.other_likelihoods import Gusts, find_gusts, lateral_force, other_likelihoods
 from crazyem.diagnosis.naming.unexplained import Unexplained
@@ -184,9 +184,9 @@ def test_gusts_are_as_sure_as_what_they_leave_allows(monkeypatch, nats, confiden
 def test_what_pushes_the_drone_away_is_no_place_that_it_is_tied_to():
     """Gusts move a drone that its loop holds: their force goes with its place, on every flight alike."""
     said = {
-        (axis, by, size): Place(
-            30.0, 300.0, Finding("force", axis, f"{by} position", by, (0.0, 20.0), size, 1e-3, "N", 30.0, 0.0)
-        ).pushed
+        (axis, by, size): pushes_away(
+            Finding("force", axis, f"{by} position", by, (0.0, 20.0), size, 1e-3, "N", 30.0, 0.0)
+        )
         for axis, by, size in (("x", "x", 0.009), ("x", "x", -0.009), ("y", "x", 0.009))
     }
     assert list(said.values()) == [True, False, False]
@@ -197,7 +197,7 @@ def test_what_pushes_the_drone_away_is_no_place_that_it_is_tied_to():
 def test_a_diagnosis_leaves_to_gusts_what_pushes_away_and_keeps_what_pulls_back(monkeypatch, recording, size, gusts):
     where = Finding("force", "x", "x position", "x", (0.0, 20.0), size, 1e-3, "N", 30.0, 0.0)
     air = Gusts(5000.0, np.ones(3), 1.0, 0.1, True, 1.6, 0.05)
-    monkeypatch.setattr("crazyem.diagnosis.diagnose.depends_on_place", lambda *_: Place(30.0, 300.0, where))
+    monkeypatch.setattr("crazyem.diagnosis.diagnose.depends_on_place", lambda *_: where)
     monkeypatch.setattr("crazyem.diagnosis.naming.other_likelihoods.find_gusts", lambda data, point: air)
     found = diagnose([recording], load_vehicle("cf2"), wanted=["gusts"])
     assert ("gusts" in [e.name for e in found.effects]) == gusts

@@ -32,24 +32,15 @@ from crazyem.physics.rotations import (
 from crazyem.vehicle import GRAVITY, Vehicle
 
 
-@dataclass(frozen=True)
-class Place:
-    """A force that depends on place: its gain on fitted and on held-out flights [nats], and its finding."""
+def pushes_away(force: Finding) -> bool:
+    """Whether a force by place grows along its own axis, so that it pushes the drone away.
 
-    nats: float
-    held_out: float
-    finding: Finding
-
-    @property
-    def pushed(self) -> bool:
-        """Whether the force grows along its own axis, so that it pushes the drone away.
-
-        A control loop that gives way to gusts looks like this on every flight. A cable pulls back.
-        """
-        return self.finding.axis == self.finding.variable and self.finding.effect_size > 0.0
+    A control loop that gives way to gusts looks like this on every flight. A cable pulls back.
+    """
+    return force.axis == force.variable and force.effect_size > 0.0
 
 
-def depends_on_place(data: Data, apart: Data | None, point: Point) -> Place | None:
+def depends_on_place(data: Data, apart: Data | None, point: Point) -> Finding | None:
     """The force by place that a model lacks; None if there is none, or without positions."""
     if "position" not in data.signals:
         return None
@@ -67,8 +58,7 @@ def depends_on_place(data: Data, apart: Data | None, point: Point) -> Place | No
         return None
     errors = np.sqrt(np.maximum(np.diag(solution.covariance), 0.0)).reshape(3, 4)[:, 1:]
     mass = point.vehicle.mass
-    finding = slope_finding(data, mass * theta.reshape(3, 4)[:, 1:], mass * errors, float(gained), point.vehicle)
-    return None if finding is None else Place(float(gained), float(held), finding)
+    return slope_finding(data, mass * theta.reshape(3, 4)[:, 1:], mass * errors, float(gained), point.vehicle)
 
 
 def left_by_place(data: Data, point: Point) -> float:

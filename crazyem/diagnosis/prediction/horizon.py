@@ -51,21 +51,6 @@ class HorizonErrors:
         return found
 
 
-@dataclass(frozen=True)
-class Worse:
-    """A quantity that a model predicts significantly worse than the model before: at a horizon [s], by a number of
-    standard errors (inf if the model left the range of numbers)."""
-
-    quantity: str
-    horizon: float
-    standard_errors: float
-
-    def to_json(self) -> dict[str, Any]:
-        """For the result document."""
-        sigmas = self.standard_errors if math.isfinite(self.standard_errors) else None
-        return {"quantity": self.quantity, "horizon_s": self.horizon, "standard_errors": sigmas}
-
-
 @dataclass(frozen=True, eq=False)
 class Windows:
     """Starts and ends of open-loop runs along a flight; the same for every model.
@@ -176,8 +161,11 @@ def errors(prediction: NDArray, at: Windows) -> HorizonErrors:
     return HorizonErrors(at.horizons, len(at.rows), rms, mean)
 
 
-def worse(pairs: Sequence[tuple[Mapping[str, NDArray], Mapping[str, NDArray]]]) -> tuple[Worse, ...]:
+def worse(pairs: Sequence[tuple[Mapping[str, NDArray], Mapping[str, NDArray]]]) -> list[dict[str, Any]]:
     """Quantities that one model predicts visibly and significantly worse than another, over the same windows.
+
+    Entries of the result document: quantity, horizon [s], and by how many standard errors (None if the model left the
+    range of numbers).
 
     Args:
         pairs: `error_lengths` (n, h) of the model before and after, one pair a flight, at `HORIZONS` from starts every
@@ -191,8 +179,9 @@ def worse(pairs: Sequence[tuple[Mapping[str, NDArray], Mapping[str, NDArray]]]) 
             grown = [after - before for before, after in squares]
             sigmas = _standard_errors(grown, max(1, math.ceil(horizon / PREDICTION.spacing - 1e-9)))
             if sigmas > PREDICTION.beyond_chance and _mean(second) > PREDICTION.min_ratio**2 * _mean(first):
-                found.append(Worse(name, horizon, sigmas))
-    return tuple(found)
+                [size] = _plain([sigmas])
+                found.append({"quantity": name, "horizon_s": horizon, "standard_errors": size})
+    return found
 
 
 def _standard_errors(differences: Sequence[NDArray], overlapping: int) -> float:

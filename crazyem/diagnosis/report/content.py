@@ -57,13 +57,6 @@ class Bar:
 
 
 @dataclass(frozen=True)
-class Meter:
-    """A share, 0 to 100 %."""
-
-    per_cent: float
-
-
-@dataclass(frozen=True)
 class Items:
     """A list; `warn` marks a reservation."""
 
@@ -74,7 +67,7 @@ class Items:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of texts, `Cell`, `Bar` or `Meter`; `right` are columns of numbers."""
+    """Rows of texts, `Cell`, `Bar` or a share in per cent; `right` are columns of numbers."""
 
     heads: tuple[str, ...]
     rows: tuple[tuple[Any, ...], ...]
@@ -259,7 +252,7 @@ def _ranking(document: Document) -> list[str | Table]:
         share = 100 * max(held or 0.0, 0.0) / best if best > 0 else 0.0
         words = spaced(entry["words"]) if entry.get("words") else effect_words(entry.get("name", ""))
         note = str(entry.get("note", "")) or ("told" if str(entry.get("name")) in named else "")
-        rows.append((words, short(entry.get("gain_nats"), ".1f"), short(held, ".1f"), Meter(round(share, 1)), note))
+        rows.append((words, short(entry.get("gain_nats"), ".1f"), short(held, ".1f"), round(share, 1), note))
     heads = ("candidate", "gain", "held out", "", "")
     return [Table(heads, tuple(rows), (1, 2)), LIKELIHOOD] if rows else []
 
@@ -319,4 +312,4 @@ def _columns(table: Table) -> Iterator[str]:
 
 def _cell_text(cell: Any) -> str:
     """A cell as text; "" for a picture."""
-    return "" if isinstance(cell, Bar | Meter) else cell.text if isinstance(cell, Cell) else str(cell)
+    return "" if isinstance(cell, Bar | float) else cell.text if isinstance(cell, Cell) else str(cell)
