@@ -24,7 +24,7 @@ from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 
 from crazyem import load_vehicle, open_recording
-from crazyem.diagnosis.naming.baseline import with_baseline
+from crazyem.diagnosis.naming.steady import with_baseline
 
 HORIZON = 50
 KINDS = ("square", "chirp", "random")

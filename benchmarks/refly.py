@@ -17,7 +17,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from crazyem.diagnosis.compare import compare
+from crazyem.diagnosis.document import compare
 from crazyem.recordings import open_recording
 from crazyem.vehicle import load_vehicle
 

@@ -173,7 +173,7 @@ def test_the_allowed_arrows_have_no_circle() -> None:
 
 
 def test_data_pass_through_the_diagnosis_one_way() -> None:
-    """What stands above its folders (`diagnose.py`, `document.py`, `compare.py`, `report/`) is used by none of them."""
+    """What stands above its folders (`diagnose.py`, `document.py`, `report/`) is used by none of them."""
     guilty = []
     for path in of_package("crazyem"):
         parts = path.relative_to(ROOT / "crazyem").with_suffix("").parts

@@ -10,12 +10,11 @@ from crazyem.api.inputs import RecordingLike, VehicleLike, recording_of, recordi
 from crazyem.api.planning import plan_commands
 from crazyem.deprecated import warn
 from crazyem.diagnosis import diagnose as by_recordings
-from crazyem.diagnosis.compare import compare
-from crazyem.diagnosis.document import document_of, saved_vehicle, text_of
-from crazyem.diagnosis.naming.baseline import with_baseline
+from crazyem.diagnosis.document import compare, document_of, saved_vehicle, text_of
+from crazyem.diagnosis.naming.steady import with_baseline
 from crazyem.diagnosis.prediction import predict as prediction
 from crazyem.diagnosis.prediction.predict import Prediction, recorded
-from crazyem.diagnosis.report.pictures import Series, draw
+from crazyem.diagnosis.report.html import Series, draw
 from crazyem.errors import UsageError
 from crazyem.notebook import finite, html_table, new_figure, saved
 from crazyem.recordings.contents import ReadOptions

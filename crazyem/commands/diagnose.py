@@ -14,7 +14,7 @@ from crazyem.live.flight_result import check_writable
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     from crazyem.api.diagnosing import diagnose
-    from crazyem.diagnosis.report.text import text_of
+    from crazyem.diagnosis.report.content import text_of
 
     for path in (arguments.json, arguments.report, arguments.write_vehicle):
         check_writable(path)

@@ -13,32 +13,40 @@ from crazyem.diagnosis.fitting.nuisances import (
     is_nonphysical,
     with_thrust_scales,
     with_trim_noise,
+    with_zero_trim,
     without_unobservable,
 )
-from crazyem.diagnosis.fitting.sampling import with_zero_trim
-from crazyem.diagnosis.flights import held_out as held_out_roles
+from crazyem.diagnosis.flights import recording_nuisances as held_out_roles
 from crazyem.diagnosis.flights.flight import Flight, flight_of
-from crazyem.diagnosis.flights.floor import with_common_floor
-from crazyem.diagnosis.flights.frame import in_mean_frame
-from crazyem.diagnosis.flights.recording_nuisances import RecordingNuisances, nuisances_of_recordings
-from crazyem.diagnosis.locating.heading import heading_by_place
+from crazyem.diagnosis.flights.recording_nuisances import (
+    RecordingNuisances,
+    in_mean_frame,
+    nuisances_of_recordings,
+    with_common_floor,
+)
 from crazyem.diagnosis.locating.locate import Located, locate
-from crazyem.diagnosis.locating.place import depends_on_place
-from crazyem.diagnosis.naming.alternatives import with_better_rivals, with_replacement
-from crazyem.diagnosis.naming.answer import Answer, answer_of, strongest_first
-from crazyem.diagnosis.naming.balance import by_balance, hidden_by_daily_variation
-from crazyem.diagnosis.naming.corroboration import false_speed, late_measurements
-from crazyem.diagnosis.naming.determined import determined, without_undetermined
-from crazyem.diagnosis.naming.free import Free, left_free
-from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, load_against_rotors, rotors_against_load
-from crazyem.diagnosis.naming.named import Named
-from crazyem.diagnosis.naming.other_likelihoods import late_rotors, other_likelihoods
-from crazyem.diagnosis.naming.place_rivals import by_place
-from crazyem.diagnosis.naming.prediction_check import with_accepted_effects, without_worse_predictions
+from crazyem.diagnosis.locating.place import depends_on_place, heading_by_place, pushes_away
+from crazyem.diagnosis.naming.alternatives import (
+    LOAD,
+    WEAKER,
+    by_place,
+    load_against_rotors,
+    rotors_against_load,
+    with_better_rivals,
+    with_replacement,
+)
+from crazyem.diagnosis.naming.answer import Answer, Free, Named, answer_of, left_free, strongest_first
+from crazyem.diagnosis.naming.balance import by_balance, hidden_by_daily_variation, steady_selection
+from crazyem.diagnosis.naming.other_likelihoods import false_speed, late_measurements, late_rotors, other_likelihoods
+from crazyem.diagnosis.naming.prune import (
+    determined,
+    with_accepted_effects,
+    without_undetermined,
+    without_worse_predictions,
+)
 from crazyem.diagnosis.naming.rotor_response import answers, unresponsive_rotor
 from crazyem.diagnosis.naming.select import select
 from crazyem.diagnosis.naming.steady import with_exact_torques, with_its_thrust, with_remaining_trim
-from crazyem.diagnosis.naming.steady_odds import steady_selection
 from crazyem.diagnosis.naming.trials import Selection, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained, unexplained
 from crazyem.diagnosis.settings import SELECTION
@@ -61,7 +69,7 @@ class Diagnosis:
     Attributes:
         fitted_vehicle: the vehicle with the found effects of the drone; `as_flown` also has those of the recordings.
         free: nuisances beside the effects.
-        swapped: whether `recordings` are those that were given as held out (see `flights/held_out.py`).
+        swapped: whether `recordings` are those that were given as held out (see `flights/recording_nuisances.py`).
     """
 
     vehicle: Vehicle
@@ -78,7 +86,6 @@ class Diagnosis:
     unexplained: Unexplained
     selection: Selection
     left_out: dict[str, str]
-    explained: float
     free: tuple[Free, ...]
     own: tuple[RecordingNuisances, ...]
     swapped: bool = False
@@ -99,7 +106,7 @@ def diagnose(
 
     Args:
         held_out: flights that confirm the effects. If the recordings only hover and these do not, the roles are
-            exchanged (`flights/held_out.py`), unless `strict`.
+            exchanged (`flights/recording_nuisances.py`), unless `strict`.
         jobs: threads that share the candidates; None: one for each core. The result is the same for any number.
 
     Raises:
@@ -121,11 +128,11 @@ def diagnose(
     before, after = _located(data, selection, say)
     place = depends_on_place(data, apart, selection.final)
     remains = unexplained(data, selection, after, apart)
-    for finding in (pull, place and place.finding, heading_by_place(data, apart)):
+    for finding in (pull, place, heading_by_place(data, apart)):
         remains = remains.with_finding(finding) if finding else remains
     left_out = {**chosen.left_out, **selection.left_out}
     left_out |= hidden_by_daily_variation(data, selection, chosen.candidates)
-    pulled = pull is not None or (place is not None and not place.pushed)
+    pulled = pull is not None or (place is not None and not pushes_away(place))
     beside = other_likelihoods(data, apart, selection.final, remains, wanted, left_out, pulled, say)
     if any(CATALOGUE[e.name].random for e in beside):
         remains = remains.without_force()
@@ -161,7 +168,6 @@ def diagnose(
         unexplained=remains,
         selection=selection,
         left_out={n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)},
-        explained=remains.explained,
         free=left_free(selection.fitted),
         own=nuisances_of_recordings(chosen.request.flights, chosen.request.held_out_flights, _strengths(selection)),
         swapped=request.swapped,
@@ -335,7 +341,10 @@ def _corroborated(
             for_sensor = (nats or 0.0) if weak else -(nats or 0.0)
             if for_sensor > (SELECTION.separating if weak else 0.0):
                 # a weak rotor turns as fast as a healthy one, so evidence against its speed is evidence for the sensor
-                selection = selection.with_evidence(other if weak else candidate, for_sensor)
+                name = other.effect if weak else candidate.effect
+                if name in selection.taken:
+                    taken = replace(selection.taken[name], other_evidence=for_sensor)
+                    selection = selection.with_step(name, taken=taken, alike=())
     return selection, frozenset(corroborated)
 
 

@@ -1,8 +1,13 @@
-"""A diagnosis as its JSON document, with the open-loop errors before and after, and the pictures of its report."""
+"""A diagnosis as its JSON document, with the open-loop errors before and after, and the pictures of its report.
+
+Standard deviations of the joint posterior of a fitted vehicle file are those of the document, which contain systematic
+errors, too. Correlations are those of the fit. Nuisances of the drone are part of the posterior, because no file gives
+them exactly.
+"""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +16,12 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.diagnose import Diagnosis
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.flights import held_out as held_out_roles
+from crazyem.diagnosis.fitting.nuisances import solved
+from crazyem.diagnosis.flights import recording_nuisances as held_out_roles
 from crazyem.diagnosis.flights.flight import without
 from crazyem.diagnosis.flights.recording_nuisances import RecordingNuisances
-from crazyem.diagnosis.joint import posterior_of
 from crazyem.diagnosis.locating.locate import Finding, strongest
-from crazyem.diagnosis.naming.named import Named
+from crazyem.diagnosis.naming.answer import Named
 from crazyem.diagnosis.prediction.horizon import (
     UNITS,
     HorizonErrors,
@@ -28,13 +33,105 @@ from crazyem.diagnosis.prediction.horizon import (
     worse,
 )
 from crazyem.diagnosis.prediction.predict import recorded
-from crazyem.diagnosis.report.pictures import Series
-from crazyem.diagnosis.report.quantities import joined, prefixed
-from crazyem.diagnosis.report.text import text_of
+from crazyem.diagnosis.report.content import text_of
+from crazyem.diagnosis.report.html import Series
+from crazyem.diagnosis.report.verdict import joined, prefixed
 from crazyem.errors import DataError
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.recordings.airborne import airtime
+from crazyem.recordings.ordering import ordered
 from crazyem.recordings.recording import Recording
-from crazyem.vehicle import Vehicle
+from crazyem.signals.sample import SIGNALS
+from crazyem.vehicle import Posterior, Vehicle
+
+
+def posterior_of(diagnosis: Diagnosis) -> Posterior | None:
+    """The joint posterior of the parameters of the drone; None if nothing is fitted."""
+    mean: dict[str, float] = {}
+    sd: dict[str, float] = {}
+    for effect in diagnosis.effects:
+        if effect.of_recording or effect.name not in diagnosis.fitted_vehicle.effects:
+            continue
+        for name, value in effect.parameters.items():
+            if math.isfinite(value.value) and math.isfinite(value.sd) and value.sd > 0.0:
+                mean[f"{effect.name}.{name}"], sd[f"{effect.name}.{name}"] = float(value.value), float(value.sd)
+    correlation: dict[tuple[str, str], float] = {}
+    fitted = diagnosis.selection.fitted
+    covariance = solved(fitted)[0].covariance
+    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    columns = list(_columns(diagnosis))
+    for i, (key, number) in enumerate(columns):
+        if key and key not in mean and spread[i] > 0.0:
+            mean[key], sd[key] = number, float(spread[i])
+    for i, (first, _) in enumerate(columns):
+        for j, (second, _) in enumerate(columns):
+            if first in mean and second in mean and spread[i] * spread[j] > 0.0:
+                correlation[first, second] = float(covariance[i, j] / (spread[i] * spread[j]))
+    if not mean:
+        return None
+    names = tuple(mean)
+    matrix = np.array([[correlation.get((a, b), float(a == b)) for b in names] for a in names])
+    np.fill_diagonal(matrix, 1.0)
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    matrix = (vectors * np.maximum(values, 1e-9)) @ vectors.T
+    scale = np.array([sd[n] for n in names])
+    joint = matrix * np.outer(scale, scale)
+    return Posterior(names, tuple(mean[n] for n in names), tuple(tuple(float(v) for v in row) for row in joint))
+
+
+def _columns(diagnosis: Diagnosis) -> Iterator[tuple[str, float]]:
+    """The columns of the fit: "effect.parameter" for parameters of the drone, else ""; and the value."""
+    fitted = diagnosis.selection.fitted
+    seen = set()
+    for candidate in (*fitted.candidates, *fitted.nuisances):
+        values = candidate.values(fitted.point)
+        effect = CATALOGUE.get(candidate.effect)
+        for name in candidate.free:
+            key = f"{candidate.effect}.{name}"
+            of_drone = effect is not None and effect.belongs_to == "vehicle"
+            yield (key if of_drone and key not in seen else ""), float(values[name])
+            seen.add(key)
+
+
+COMPARED = ("position", "velocity", "attitude", "body_rate", "motor_command", "rotor_speed", "voltage")
+
+
+def compare(recording: Recording, simulated: Recording) -> dict[str, Any]:
+    """Differences of the signals that both recordings have, aligned at take-off.
+
+    Raises:
+        DataError: one of them holds no flight.
+    """
+    begins, lasts = [], []
+    for one in (recording, simulated):
+        air = airtime(one)
+        if not air.flown:
+            raise DataError(f"{one.path}: nothing was flown in this recording, so there is nothing to compare")
+        begins.append(air.flown[0][0])
+        lasts.append(air.flown[-1][1] - air.flown[0][0])
+    seconds = min(lasts)
+    found: dict[str, Any] = {"simulated": simulated.path, "seconds": seconds, "signals": {}}
+    for name in COMPARED:
+        if name not in recording.signals or name not in simulated.signals:
+            continue
+        (t, value), (t_sim, value_sim) = ordered(recording.signals[name]), ordered(simulated.signals[name])
+        t, t_sim = t - begins[0], t_sim - begins[1]
+        rows = (t >= 0) & (t <= seconds)
+        if not rows.any() or t_sim.size < 2:
+            continue
+        theirs = np.stack([np.interp(t[rows], t_sim, column) for column in value_sim.T], 1)
+        mine = value[rows]
+        if name == "attitude":
+            dot = np.abs(np.sum(mine * theirs, axis=1)) / np.linalg.norm(theirs, axis=1)
+            size, unit = 2 * np.arccos(np.clip(dot, 0.0, 1.0)), "rad"
+        else:
+            size, unit = np.linalg.norm(mine - theirs, axis=1), SIGNALS[name][1]
+        found["signals"][name] = {
+            "rms": float(np.sqrt(np.mean(size**2))), "largest": float(size.max()),
+            "when": float(t[rows][int(np.argmax(size))]), "unit": unit,
+        }  # fmt: skip
+    return found
+
 
 __all__ = ["document_of", "notices_of", "saved_vehicle", "text_of"]
 MOST_PICTURES = 4  # of signals with findings
@@ -96,12 +193,13 @@ def document_of(
             *notices_of(diagnosis.own),
         ],
     }
-    return document, pictures_of(diagnosis, train)
+    first = train[0] if train else None
+    return document, accused_pictures(diagnosis, first) | (error_pictures(first) if first else {})
 
 
 def _left_free(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Free parameters beside the effects: of the fit, of each recording, and written into the vehicle unnamed."""
-    found = [free.to_json() for free in diagnosis.free]
+    found = [asdict(free) for free in diagnosis.free]
     for own in diagnosis.own:
         found += own.free()
     named = {e.fitted_as or e.name for e in diagnosis.effects}
@@ -130,11 +228,7 @@ def _of_recordings(effects: Sequence[Named]) -> list[str]:
 
 def notices_of(own: Sequence[RecordingNuisances]) -> list[str]:
     """The notices of each recording, with its name if there are several."""
-    return [_named(o.recording, text, len(own) > 1) for o in own for text in o.notices]
-
-
-def _named(recording: str, text: str, several: bool) -> str:
-    return f"{Path(recording).name}: {text}" if several else text
+    return [f"{Path(o.recording).name}: {text}" if len(own) > 1 else text for o in own for text in o.notices]
 
 
 def _effect(effect: Named) -> dict[str, Any]:
@@ -198,10 +292,6 @@ class Compared:
     at: Windows
     runs: tuple[NDArray, ...]  # before, after, and by the fitted vehicle
 
-    @property
-    def errors(self) -> list[HorizonErrors]:
-        return [errors(run, self.at) for run in self.runs]
-
 
 def _compared(recordings: Sequence[Recording], vehicles: Sequence[Vehicle]) -> list[Compared]:
     """Predictions of every recording with complete states, by each vehicle over the same windows."""
@@ -220,10 +310,10 @@ def _before_after(compared: Sequence[Compared]) -> dict[str, Any]:
     """Errors before and after the fit, and by the fitted vehicle if predicted; and quantities that are worse."""
     if not compared:
         return {}
-    by_model = zip(*(c.errors for c in compared), strict=True)
+    by_model = zip(*([errors(run, c.at) for run in c.runs] for c in compared), strict=True)
     found: dict[str, Any] = dict(zip(("before", "after", "vehicle"), map(_pooled, by_model), strict=False))
     lengths = [(error_lengths(c.runs[0], c.at), error_lengths(c.runs[1], c.at)) for c in compared]
-    return {**found, "worse": [w.to_json() for w in worse(lengths)]}
+    return {**found, "worse": worse(lengths)}
 
 
 def _pooled(found: Sequence[HorizonErrors]) -> dict[str, Any]:
@@ -244,12 +334,6 @@ def _gap_closed(errors_of: Mapping[str, Any]) -> dict[str, float | None]:
         before, after = (errors_of[k][name]["rms"][-1] if errors_of else None for k in ("before", "after"))
         closed[name] = 1.0 - (after / before) ** 2 if before and after is not None else None
     return closed
-
-
-def pictures_of(diagnosis: Diagnosis, compared: Sequence[Compared]) -> dict[str, Series]:
-    """Pictures of signals with findings over time, and of errors of open-loop predictions."""
-    found = accused_pictures(diagnosis, compared[0] if compared else None)
-    return found | (error_pictures(compared[0]) if compared else {})
 
 
 def accused_pictures(diagnosis: Diagnosis, compared: Compared | None) -> dict[str, Series]:

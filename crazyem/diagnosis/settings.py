@@ -40,7 +40,7 @@ class Recordings:
 
 @dataclass(frozen=True)
 class Clocks:
-    """Delay between signals (`flights/alignment.py`, `flights/band_delay.py`, `naming/corroboration.py`)."""
+    """Delay between signals (`flights/alignment.py`, `naming/other_likelihoods.py`)."""
 
     max_delay: float = 0.15  # s, of either sign, between state and inputs; assumed
     max_delay_sd: float = 4e-3  # s; standard error of a delay that is used; assumed: half a sample
@@ -64,7 +64,7 @@ class Clocks:
 
 @dataclass(frozen=True)
 class Levelling:
-    """World frames, floor and take-off (`flights/frame.py`, `flights/floor.py`, `flights/level.py`)."""
+    """World frames, floor and take-off (`flights/recording_nuisances.py`, `flights/inputs.py`)."""
 
     step: float = 0.01  # s between rows for second derivatives of the position
     width: int = 21  # rows of the polynomial (Savitzky and Golay): 0.2 s, shorter than manoeuvres
@@ -125,7 +125,7 @@ class NoiseFit:
 
 @dataclass(frozen=True)
 class Fitting:
-    """Maximum of the posterior (`fitting/fit.py`, `fitting/gram.py`, `fitting/nuisances.py`, `fitting/sampling.py`)."""
+    """Maximum of the posterior (`fitting/fit.py`, `fitting/gram.py`, `fitting/nuisances.py`)."""
 
     rounds: int = 6  # of Gauss-Newton
     tries: int = 6  # of a step, each a third as long as the last
@@ -178,7 +178,7 @@ class Location:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Torques that are random or shake (`locating/random_torques.py`, `naming/unexplained.py`)."""
+    """Torques that are random or shake (`naming/unexplained.py`)."""
 
     chance: float = 1e-5  # p-value that no rotor stands out, corrected for the number of rotors
     min_t: float = 2.33  # of roll with pitch, and of both with yaw: p = 0.01 each; a product of inertia has one of them
@@ -222,7 +222,7 @@ class Selection:
 
 @dataclass(frozen=True)
 class Confidence:
-    """Probability of a name (`naming/presence.py`, `naming/named.py`, `naming/steady_odds.py`, `report/verdict.py`).
+    """Probability of a name (`naming/trials.py`, `naming/answer.py`, `naming/balance.py`, `report/verdict.py`).
 
     Log-odds of the k-th effect found: intercept + gain_power log(1 + gain over dispersion) - order_power log(k) + those
     of held-out flights. Models are approximate: wrong effects gain tens of nats, with a heavy tail. So the odds grow
@@ -255,7 +255,7 @@ class Confidence:
 
 @dataclass(frozen=True)
 class Loads:
-    """Steady forces and torques: what a hover can tell (`naming/balance.py`, `naming/detection_limits.py`)."""
+    """Steady forces and torques: what a hover can tell (`naming/balance.py`, `naming/evidence.py`)."""
 
     max_load: float = 1.0  # weight over the drone's; assumed
     max_place: float = 0.99  # share of the furthest place on board
@@ -269,7 +269,7 @@ class Loads:
 
 @dataclass(frozen=True)
 class Wind:
-    """Forces with memory (`naming/gusts.py`, `naming/other_likelihoods.py`)."""
+    """Forces with memory (`naming/other_likelihoods.py`)."""
 
     memories: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0)  # s; correlation times that are tried
     min_gain: float = 40.0  # nats; assumed
@@ -284,7 +284,7 @@ class Wind:
 
 @dataclass(frozen=True)
 class Accelerometer:
-    """How the accelerometer is mounted (`naming/accelerometer.py`)."""
+    """How the accelerometer is mounted (`naming/other_likelihoods.py`)."""
 
     step: float = 1e-3  # rad, for differences
     bias_sd: float = 0.03  # m/s^2; what remains after the firmware removes the bias at rest

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import Candidate, impossible, variants
-from crazyem.diagnosis.fitting.conditions import conditions_of
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.nuisances import conditions_of
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.errors import UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE

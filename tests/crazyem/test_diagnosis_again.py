@@ -16,12 +16,12 @@ from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import DivergedError
 from crazyem.diagnosis.fitting.nuisances import COARSE_REASON, refine_base
 from crazyem.diagnosis.locating.locate import Finding
-from crazyem.diagnosis.locating.random_torques import AT_RANDOM
-from crazyem.diagnosis.naming import answer, onset, trials
-from crazyem.diagnosis.naming.named import confidence_factor
+from crazyem.diagnosis.naming import answer, trials
+from crazyem.diagnosis.naming import starting_points as onset
+from crazyem.diagnosis.naming.answer import confidence_factor
 from crazyem.diagnosis.naming.select import select
 from crazyem.diagnosis.naming.trials import Selection
-from crazyem.diagnosis.naming.unexplained import Unexplained, notable
+from crazyem.diagnosis.naming.unexplained import AT_RANDOM, Unexplained, notable
 from crazyem.diagnosis.settings import CONFIDENCE
 from crazyem.physics.effects import mass_properties
 

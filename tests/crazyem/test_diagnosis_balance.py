@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
-from crazyem.diagnosis.fitting.days import day_freedom, day_sd
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, local_precision, log_prior
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import start_noise
+from crazyem.diagnosis.fitting.nuisances import day_freedom, day_sd
 from crazyem.diagnosis.naming import balance as balancing
 from crazyem.diagnosis.naming.answer import _by_the_day, _steady_rivals
 from crazyem.diagnosis.naming.balance import (
@@ -26,14 +26,15 @@ from crazyem.diagnosis.naming.balance import (
     balance_loglik,
     balance_of,
     by_balance,
+    decided_by_balance,
+    explanations,
     hidden_by_daily_variation,
     log_odds_by_balance,
     rotor_loss,
     rotor_signatures,
     steady,
 )
-from crazyem.diagnosis.naming.baseline import spread_of, with_baseline
-from crazyem.diagnosis.naming.steady_odds import decided_by_balance, explanations
+from crazyem.diagnosis.naming.steady import spread_of, with_baseline
 from crazyem.diagnosis.naming.trials import Trial
 from crazyem.errors import UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -143,7 +144,7 @@ def test_a_name_stands_unless_another_is_better_or_a_simpler_one_no_worse(monkey
     are weak."""
     instead: list[Trial] = []
     sized: list[float] = []
-    monkeypatch.setattr(balancing, "_instead", lambda data, s, step, old, trial: instead.append(trial) or s)
+    monkeypatch.setattr(balancing, "_instead", lambda data, s, old, trial: instead.append(trial) or s)
     monkeypatch.setattr(balancing, "_sized", lambda data, s, mine, values: sized.append(values["scale"]) or s)
     fitted: Any = SimpleNamespace()
 
@@ -164,7 +165,8 @@ def test_a_name_stands_unless_another_is_better_or_a_simpler_one_no_worse(monkey
         shown = balance(lack)
         trials = (trial(name), trial(rival), trial(DRAG), unfitted)
         step: Any = SimpleNamespace(taken=trials[0], explanations=lambda trials=trials: list(trials[1:]))
-        selection: Any = SimpleNamespace(accepted=(name, DRAG), steps=(step,), nominal=point)
+        taken_before = {name.effect: trials[0]}
+        selection: Any = SimpleNamespace(accepted=(name, DRAG), steps=(step,), taken=taken_before, nominal=point)
         monkeypatch.setattr(balancing, "balance_of", lambda data, point, shown=shown: shown)
         instead.clear()
         sized.clear()
@@ -176,7 +178,7 @@ def test_a_name_stands_unless_another_is_better_or_a_simpler_one_no_worse(monkey
     trimmed = (LOAD, Candidate(TRIM, (), ("x",)))
     asked = [((LOAD, THRUST), TRIMMED), ((rotor(2, onset=3.0),), TRIMMED), (trimmed, TRIMMED), ((LOAD,), DRONE)]
     for accepted, vehicle in asked:
-        other: Any = SimpleNamespace(accepted=accepted, steps=(step,), nominal=Point(vehicle, {}, start_noise()))
+        other: Any = SimpleNamespace(accepted=accepted, taken={}, nominal=Point(vehicle, {}, start_noise()))
         assert by_balance(data, other) == (other, None)
 
     def lost(data: Data, point: Point) -> Balance:

@@ -20,8 +20,7 @@ from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.place import depends_on_place
 from crazyem.diagnosis.naming.answer import answer_of
-from crazyem.diagnosis.naming.corroboration import _lag_of, false_speed, late_measurements
-from crazyem.diagnosis.naming.presence import presence
+from crazyem.diagnosis.naming.other_likelihoods import _lag_of, false_speed, late_measurements
 from crazyem.diagnosis.naming.trials import (
     Selection,
     Step,
@@ -29,6 +28,7 @@ from crazyem.diagnosis.naming.trials import (
     between,
     distinguishable,
     margin,
+    presence,
     scatter,
 )
 from crazyem.diagnosis.naming.unexplained import Unexplained
@@ -206,7 +206,7 @@ def test_a_force_that_depends_on_place_holds_on_the_next_flight() -> None:
     pulled = [data_of(fly(Hidden(rope=0.02), seed=s, seconds=9.0)) for s in (1, 2)]
     free = [data_of(fly(seed=s, seconds=9.0)) for s in (1, 2)]
     found = depends_on_place(pulled[0], pulled[1], settled(pulled))
-    assert (found.finding.signal, found.finding.axis, found.finding.variable) == ("force", "x", "x")
+    assert (found.signal, found.axis, found.variable) == ("force", "x", "x")
     assert depends_on_place(free[0], free[1], settled(free)) is None
 
 

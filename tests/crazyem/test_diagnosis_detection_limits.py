@@ -21,7 +21,7 @@ from diagnosis_parts import (
 
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.nuisances import is_nonphysical
-from crazyem.diagnosis.naming.detection_limits import exceeds_limit, is_implausible
+from crazyem.diagnosis.naming.evidence import exceeds_limit, is_implausible
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.prior import Conditions
 

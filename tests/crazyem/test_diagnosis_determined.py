@@ -16,9 +16,9 @@ from crazyem.diagnosis.document import document_of
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.nuisances import refine_base
-from crazyem.diagnosis.naming import determined as deciding
-from crazyem.diagnosis.naming.determined import determined, without_undetermined
-from crazyem.diagnosis.naming.named import Named, Value, interval_95
+from crazyem.diagnosis.naming import prune as deciding
+from crazyem.diagnosis.naming.answer import Named, Value
+from crazyem.diagnosis.naming.prune import determined, without_undetermined
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings.recording import Recording
@@ -32,7 +32,7 @@ def named(effect: str, values: dict[str, Value], **chosen: object) -> Named:
 
 
 def value(number: float, sd: float, ends: tuple[float, float] | None = None) -> Value:
-    return Value(number, "", sd, ends or interval_95(number, sd))
+    return Value(number, "", sd, ends or Value.normal(number, "", sd).ci95)
 
 
 def neutral_of(effect: str, name: str) -> float:

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.cli import main
-from crazyem.diagnosis.flights import held_out as held_out_roles
+from crazyem.diagnosis.flights import recording_nuisances as held_out_roles
 from crazyem.diagnosis.flights.flight import Flight, flight_of
 from crazyem.recordings.mcap.signals import write_recording
 

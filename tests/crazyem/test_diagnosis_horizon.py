@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from scipy.spatial.transform import Rotation
 from crazyem.diagnosis.prediction.horizon import (
     HORIZONS,
     UNITS,
+    HorizonErrors,
+    Windows,
     errors,
-    horizon_errors,
     lengths,
     open_loop,
     windows,
@@ -28,6 +30,11 @@ from crazyem.vehicle import load_vehicle
 Array = NDArray[np.float64]
 TIMES = np.arange(0.0, 2.5, 0.01)
 FINE = np.arange(0.0, 2.5, 0.001)
+
+
+def horizon_errors(shown: Recorded, at: Windows | None = None, **model: Any) -> HorizonErrors:
+    at = windows(shown) if at is None else at
+    return errors(open_loop(shown, at, **model), at)
 
 
 @pytest.fixture(scope="module")
@@ -74,11 +81,11 @@ def test_with_the_measured_attitude_forces_are_judged_alone(flown: Recorded) -> 
 
 
 def test_runs_lie_within_the_intervals_that_are_asked_for(flown: Recorded) -> None:
-    at = windows(flown, within=[(0.2, 1.0), (1.5, 1.6)], spacing=0.05)
+    at = windows(replace(flown, flights=((0.2, 1.0), (1.5, 1.6))), spacing=0.05)
     assert at.times.min() >= 0.2
     assert at.times.max() <= 1.0 + 0.006
     with pytest.raises(DataError, match=r"no stretch of flight is long enough for 0\.5 s"):
-        windows(flown, within=[(0.2, 0.4)])
+        windows(replace(flown, flights=((0.2, 0.4),)))
 
 
 def test_rms_and_mean_are_of_the_lengths() -> None:
@@ -123,7 +130,7 @@ def test_the_numbers_of_real_flights(shared_recordings: Path) -> None:
     real = open_recording(shared_recordings / "real_firmware" / "lee_34g_mass_pushed_midflight.csv.gz")
     right = replace(load_vehicle("cf2"), mass=0.034, motor_time_constant=0.03)
     shown = recorded(real, right)
-    at = windows(shown, within=[(12.0, 29.0)])
+    at = windows(replace(shown, flights=((12.0, 29.0),)))
     good = horizon_errors(shown, at=at)
     bad = horizon_errors(shown, vehicle=replace(right, mass=0.029), at=at)
     assert good.rms["position"][1] < 0.006
@@ -144,14 +151,14 @@ def test_worse_is_what_grows_by_more_than_chance_and_visibly() -> None:
     rng = np.random.default_rng(0)
     before = rng.uniform(0.5, 1.5, 400)
     grown = before * 1.1
-    assert {(w.quantity, w.horizon) for w in worse([(lengths_of(before), lengths_of(grown))])} == {
+    assert {(w["quantity"], w["horizon_s"]) for w in worse([(lengths_of(before), lengths_of(grown))])} == {
         (n, h) for n in UNITS for h in HORIZONS
     }
-    assert worse([(lengths_of(grown), lengths_of(before))]) == ()
-    assert worse([(lengths_of(before), lengths_of(before * 1.001))]) == ()  # sure, and nothing that anyone sees
-    assert worse([(lengths_of(before), lengths_of(before + rng.normal(0.0, 0.01, 400)))]) == ()
-    assert worse([(lengths_of(before[:4]), lengths_of(grown[:4]))]) == ()  # too few to know what chance does
-    assert worse([]) == ()
+    assert worse([(lengths_of(grown), lengths_of(before))]) == []
+    assert worse([(lengths_of(before), lengths_of(before * 1.001))]) == []  # sure, and nothing that anyone sees
+    assert worse([(lengths_of(before), lengths_of(before + rng.normal(0.0, 0.01, 400)))]) == []
+    assert worse([(lengths_of(before[:4]), lengths_of(grown[:4]))]) == []  # too few to know what chance does
+    assert worse([]) == []
 
 
 def test_windows_that_overlap_count_as_one() -> None:
@@ -161,7 +168,7 @@ def test_windows_that_overlap_count_as_one() -> None:
     for _ in range(300):
         change = np.repeat(rng.normal(0.0, 0.1, 30), 5)
         for one in worse([(lengths_of(np.ones(150)), lengths_of(np.sqrt(1.0 + change)))]):
-            alarms[one.horizon] += one.quantity == "position"
+            alarms[one["horizon_s"]] += one["quantity"] == "position"
     assert alarms[0.5] < 0.06 * 300 < alarms[0.1]
 
 
@@ -170,5 +177,5 @@ def test_what_leaves_the_range_of_numbers_is_worse_and_what_is_not_measured_is_n
     after["attitude"] = np.full((50, len(HORIZONS)), np.inf)
     after["velocity"] = before["velocity"] = np.full((50, len(HORIZONS)), np.nan)
     found = worse([(before, after)])
-    assert {w.quantity for w in found} == {"attitude"}
-    assert found[0].to_json() == {"quantity": "attitude", "horizon_s": 0.01, "standard_errors": None}
+    assert {w["quantity"] for w in found} == {"attitude"}
+    assert found[0] == {"quantity": "attitude", "horizon_s": 0.01, "standard_errors": None}

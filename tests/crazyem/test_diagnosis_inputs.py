@@ -10,7 +10,7 @@ from made_flight import array_of, made_flight, without
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.diagnosis.flights.inputs import inputs_of, rotor_input
+from crazyem.diagnosis.flights.inputs import inputs_of
 from crazyem.diagnosis.settings import RECORDINGS
 from crazyem.errors import DataError, FileFormatError
 from crazyem.physics import folding
@@ -37,11 +37,11 @@ def constant(value: float, count: int = 4, rows: int = TIMES.size) -> Array:
 
 def test_measured_speeds_come_first_where_the_vehicle_knows_them() -> None:
     both = recording(rotor_speed=constant(1500.0), motor_command=constant(0.6), voltage=constant(3.9, 1))
-    found = rotor_input(both, BOTH)
+    found = inputs_of(both, BOTH).rotor
     assert found.measured
     assert np.allclose(found.thrust, 3e-8 * 1500.0**2)
     assert np.allclose(found.voltage, 3.9)
-    found = rotor_input(both, load_vehicle("cf2"))
+    found = inputs_of(both, load_vehicle("cf2")).rotor
     assert not found.measured
     volts = 0.6 * 3.9
     curve = load_vehicle("cf2").thrust_curve
@@ -51,7 +51,7 @@ def test_measured_speeds_come_first_where_the_vehicle_knows_them() -> None:
 def test_the_voltage_is_the_newest_and_commands_before_the_first_are_left_out() -> None:
     given = recording(motor_command=constant(0.6))
     volts = array_of("voltage", [0.5, 1.0], [[4.0], [3.6]], place=5)
-    found = rotor_input(replace(given, signals={**given.signals, "voltage": volts}), load_vehicle("cf2"))
+    found = inputs_of(replace(given, signals={**given.signals, "voltage": volts}), load_vehicle("cf2")).rotor
     assert found.time[0] == pytest.approx(0.5)
     assert (found.voltage[found.time < 0.999] == 4.0).all()
     assert (found.voltage[found.time > 1.001] == 3.6).all()
@@ -59,7 +59,9 @@ def test_the_voltage_is_the_newest_and_commands_before_the_first_are_left_out() 
 
 def test_without_a_voltage_a_nominal_one_is_used_and_said() -> None:
     found = inputs_of(recording(motor_command=constant(0.6)), load_vehicle("cf2"))
-    other = rotor_input(recording(motor_command=constant(0.6), voltage=constant(RECORDINGS.nominal_voltage, 1)), BOTH)
+    other = inputs_of(
+        recording(motor_command=constant(0.6), voltage=constant(RECORDINGS.nominal_voltage, 1)), BOTH
+    ).rotor
     assert np.allclose(found.rotor.thrust, other.thrust)
     assert np.isnan(found.rotor.voltage).all()
     assert "3.85 V is assumed" in found.notices[0]
@@ -90,9 +92,8 @@ def test_stamps_increase_and_wild_samples_are_no_commands() -> None:
     time = array.time.copy()
     time[20] = time[19]
     time[30] = time[28]
-    found = rotor_input(
-        replace(given, signals={**given.signals, "motor_command": replace(array, time=time)}), load_vehicle("cf2")
-    )
+    moved = replace(given, signals={**given.signals, "motor_command": replace(array, time=time)})
+    found = inputs_of(moved, load_vehicle("cf2")).rotor
     assert (np.diff(found.time) > 0).all()
     assert found.time.size == TIMES.size - 4
     assert np.isfinite(found.thrust).all()
@@ -110,12 +111,12 @@ def test_requests_of_old_firmware_become_the_volts_that_it_sent(shared_recording
     """crazypad logs both the request and the duty: thrust from either is one, within 0.3 mN of 75."""
     flown = open_recording(shared_recordings / "crazypad" / "motor__normal_flight__E8_log00")
     vehicle = load_vehicle("cf2-legacy")
-    sent = rotor_input(flown, vehicle)
+    sent = inputs_of(flown, vehicle).rotor
     asked = inputs_of(without(flown, "motor_command"), vehicle)
     assert asked.signal == "motor_request"
     assert np.abs(sent.thrust - asked.rotor.thrust).max() < 3e-4
     mixer = open_recording(shared_recordings / "crazypad" / "controller__normal_flight__E8_log00")
-    found = rotor_input(mixer, vehicle)
+    found = inputs_of(mixer, vehicle).rotor
     total = [np.median(r.thrust.sum(1)[r.thrust.sum(1) > 0.2]) for r in (found, sent)]
     assert total[0] == pytest.approx(total[1], rel=0.03)  # two flights of one drone on one day
 

@@ -22,10 +22,16 @@ from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import error_by_lag, nuisances, refine_base, systematic_sd
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.naming import answer, trials
-from crazyem.diagnosis.naming.answer import _numbers, _rivals, _uncertainty, strongest_first
-from crazyem.diagnosis.naming.named import Named, confidence_factor, one_factor
-from crazyem.diagnosis.naming.presence import held_out_evidence, improbable, presence
-from crazyem.diagnosis.naming.trials import Selection, Step, Trial
+from crazyem.diagnosis.naming.answer import (
+    Named,
+    _numbers,
+    _rivals,
+    _uncertainty,
+    confidence_factor,
+    one_factor,
+    strongest_first,
+)
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial, held_out_evidence, improbable, presence
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.diagnosis.settings import CONFIDENCE, FITTING
 

@@ -12,16 +12,14 @@ from diagnosis_parts import nominal_of, silent, start_point
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis.compare import compare
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.document import text_of
+from crazyem.diagnosis.document import compare, text_of
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.flights.flight import without
 from crazyem.diagnosis.locating.locate import Finding
-from crazyem.diagnosis.locating.place import Place
-from crazyem.diagnosis.naming import accelerometer
-from crazyem.diagnosis.naming.gusts import Gusts, find_gusts, lateral_force
-from crazyem.diagnosis.naming.other_likelihoods import other_likelihoods
+from crazyem.diagnosis.locating.place import pushes_away
+from crazyem.diagnosis.naming import other_likelihoods as beside
+from crazyem.diagnosis.naming.other_likelihoods import Gusts, find_gusts, lateral_force, other_likelihoods
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.diagnosis.settings import ACCELEROMETER, CONFIDENCE
 from crazyem.errors import DataError
@@ -64,12 +62,12 @@ def test_a_tilted_accelerometer_is_measured_and_an_upright_one_is_not_accused(re
     turned = tilted(recording, 0.03, -0.02)
     for flown, true in ((turned, (0.03, -0.02)), (recording, (0.0, 0.0))):
         data, point = fitted(flown)
-        solution = accelerometer.tilt(data, point)
+        solution = beside.tilt(data, point)
         sd = np.sqrt(np.diag(solution.covariance)[:2])
         assert np.all(np.abs(solution.theta[:2] - true) < 4 * sd)
         assert np.all((sd > ACCELEROMETER.angle_sd) & (sd < 2e-3))
-        named = judged(data, point, accelerometer.EFFECT)
-        assert [f.name for f in named] == [accelerometer.EFFECT] * (flown is turned)
+        named = judged(data, point, beside.MISALIGNED)
+        assert [f.name for f in named] == [beside.MISALIGNED] * (flown is turned)
         # thrust along z does not show the yaw: a board's few degrees, not what the residuals' scatter makes of it
         yaw, unsure = solution.theta[2], np.sqrt(solution.covariance[2, 2])
         assert abs(yaw) < 2 * unsure
@@ -80,14 +78,14 @@ def test_a_tilted_accelerometer_is_measured_and_an_upright_one_is_not_accused(re
 def test_a_yaw_that_nothing_shows_is_no_tilt(recording, monkeypatch, roll, held, told):
     """Nor is a roll that held-out flights do not confirm."""
     data, point = fitted(recording)
-    solution = accelerometer.tilt(data, point)
+    solution = beside.tilt(data, point)
     theta, sds = np.array([roll, 0.0, 0.08, *np.zeros(4)]), np.array([1e-4, 1e-4, 0.1, *np.ones(4)])
-    monkeypatch.setattr(accelerometer, "tilt", lambda *_: replace(solution, theta=theta, covariance=np.diag(sds**2)))
-    monkeypatch.setattr(accelerometer, "held_out_gain", lambda *given, **more: held)
-    found = judged(data, point, accelerometer.EFFECT)
-    assert [f.name for f in found] == [accelerometer.EFFECT] * told
+    monkeypatch.setattr(beside, "tilt", lambda *_: replace(solution, theta=theta, covariance=np.diag(sds**2)))
+    monkeypatch.setattr(beside, "held_out_gain", lambda *given, **more: held)
+    found = judged(data, point, beside.MISALIGNED)
+    assert [f.name for f in found] == [beside.MISALIGNED] * told
     left = Finding("force", "z", "z position", "z", (0.0, 9.0), 5e-3, 5e-4, "N", 250.0, 1e-9)
-    doubtful = judged(data, point, accelerometer.EFFECT, Unexplained((left,), 0.0))
+    doubtful = judged(data, point, beside.MISALIGNED, Unexplained((left,), 0.0))
     for one, other in zip(found, doubtful, strict=True):
         assert other.confidence == pytest.approx(CONFIDENCE.doubtful * one.confidence)
         assert other.log_odds == one.log_odds
@@ -98,9 +96,7 @@ def test_a_yaw_that_was_not_seen_does_not_cost_what_the_tilt_brings(recording):
     is known to be unsure."""
     data, point = fitted(tilted(recording, 0.03, -0.02))
     point = point.with_effects({"linear_drag": {"x": 0.03, "y": 0.03, "z": 0.03}})
-    sure, unsure = (
-        accelerometer.held_out_gain(data, point, np.array([0.03, -0.02, 0.3]), yaw_sd=sd) for sd in (1e-4, 0.3)
-    )
+    sure, unsure = (beside.held_out_gain(data, point, np.array([0.03, -0.02, 0.3]), yaw_sd=sd) for sd in (1e-4, 0.3))
     assert unsure > sure + 1.0
 
 
@@ -111,12 +107,12 @@ def test_what_a_prior_says_is_no_weaker_because_residuals_scatter(recording):
     assert instead > 60
     for model in data.models:  # from second to second, on the whole nothing
         model.flight.force[:] += 0.2 * (-1.0) ** np.floor(model.flight.time)[:, None]
-    assert accelerometer.gram_dispersion(data, point) > 3
-    assert accelerometer.held_out_gain(data, point, np.array([0.03, -0.02, 0.0]), yaw_sd=0.3) > 0.5 * instead
+    assert beside.gram_dispersion(data, point) > 3
+    assert beside.held_out_gain(data, point, np.array([0.03, -0.02, 0.0]), yaw_sd=0.3) > 0.5 * instead
 
 
 def test_without_an_accelerometer_nothing_is_said(recording):
-    assert accelerometer.tilt(*fitted(without(recording, ["specific_force"]))) is None
+    assert beside.tilt(*fitted(without(recording, ["specific_force"]))) is None
 
 
 def test_a_calm_flight_has_no_gusts(recording):
@@ -188,9 +184,9 @@ def test_gusts_are_as_sure_as_what_they_leave_allows(monkeypatch, nats, confiden
 def test_what_pushes_the_drone_away_is_no_place_that_it_is_tied_to():
     """Gusts move a drone that its loop holds: their force goes with its place, on every flight alike."""
     said = {
-        (axis, by, size): Place(
-            30.0, 300.0, Finding("force", axis, f"{by} position", by, (0.0, 20.0), size, 1e-3, "N", 30.0, 0.0)
-        ).pushed
+        (axis, by, size): pushes_away(
+            Finding("force", axis, f"{by} position", by, (0.0, 20.0), size, 1e-3, "N", 30.0, 0.0)
+        )
         for axis, by, size in (("x", "x", 0.009), ("x", "x", -0.009), ("y", "x", 0.009))
     }
     assert list(said.values()) == [True, False, False]
@@ -201,7 +197,7 @@ def test_what_pushes_the_drone_away_is_no_place_that_it_is_tied_to():
 def test_a_diagnosis_leaves_to_gusts_what_pushes_away_and_keeps_what_pulls_back(monkeypatch, recording, size, gusts):
     where = Finding("force", "x", "x position", "x", (0.0, 20.0), size, 1e-3, "N", 30.0, 0.0)
     air = Gusts(5000.0, np.ones(3), 1.0, 0.1, True, 1.6, 0.05)
-    monkeypatch.setattr("crazyem.diagnosis.diagnose.depends_on_place", lambda *_: Place(30.0, 300.0, where))
+    monkeypatch.setattr("crazyem.diagnosis.diagnose.depends_on_place", lambda *_: where)
     monkeypatch.setattr("crazyem.diagnosis.naming.other_likelihoods.find_gusts", lambda data, point: air)
     found = diagnose([recording], load_vehicle("cf2"), wanted=["gusts"])
     assert ("gusts" in [e.name for e in found.effects]) == gusts

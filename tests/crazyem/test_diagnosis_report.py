@@ -19,11 +19,9 @@ from crazyem.diagnosis.locating.locate import Disturbance, Finding, Located
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.diagnosis.prediction.horizon import HORIZONS, Windows
 from crazyem.diagnosis.report import Series, write_report
-from crazyem.diagnosis.report.html import report
-from crazyem.diagnosis.report.pictures import data_uri, thinned
-from crazyem.diagnosis.report.quantities import quantity, span
-from crazyem.diagnosis.report.text import text_of
-from crazyem.diagnosis.report.verdict import claim, verdict
+from crazyem.diagnosis.report.content import text_of
+from crazyem.diagnosis.report.html import data_uri, report, thinned
+from crazyem.diagnosis.report.verdict import claim, quantity, span, verdict
 from crazyem.errors import UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE
 

@@ -14,11 +14,10 @@ from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, with_torque_mem
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import held_out_fit, held_out_twin, nuisances, refine_base, with_nuisances
-from crazyem.diagnosis.locating.random_torques import peaks
-from crazyem.diagnosis.naming import onset, prune
+from crazyem.diagnosis.naming import prune
 from crazyem.diagnosis.naming import select as selecting
+from crazyem.diagnosis.naming import starting_points as onset
 from crazyem.diagnosis.naming.evidence import joint_gain
-from crazyem.diagnosis.naming.onset import ONSET, date, onset_of
 from crazyem.diagnosis.naming.select import (
     Basis,
     compared,
@@ -29,7 +28,9 @@ from crazyem.diagnosis.naming.select import (
     step_of,
     with_held_out_by,
 )
+from crazyem.diagnosis.naming.starting_points import ONSET, date, onset_of
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
+from crazyem.diagnosis.naming.unexplained import peaks
 from crazyem.diagnosis.workers import Workers
 
 ONSET_TIME = 4.37  # s

@@ -14,9 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.diagnosis.fitting.candidates import Candidate, variants
-from crazyem.diagnosis.fitting.divergence import diverges
 from crazyem.diagnosis.fitting.fit import nominal
-from crazyem.diagnosis.fitting.model import Model
+from crazyem.diagnosis.fitting.model import Model, diverges
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import starting_points

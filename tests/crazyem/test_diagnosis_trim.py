@@ -16,17 +16,18 @@ from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Noise, Point
 from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import (
+    fast_share,
+    mean_torque,
     nuisances,
     refine_base,
+    with_zero_trim,
     without,
     without_unobservable,
 )
-from crazyem.diagnosis.fitting.sampling import fast_share, mean_torque, with_zero_trim
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.diagnosis.naming.balance import balance_of
-from crazyem.diagnosis.naming.baseline import with_baseline
-from crazyem.diagnosis.naming.detection_limits import usual_gusts
-from crazyem.diagnosis.naming.steady_odds import explanations
+from crazyem.diagnosis.naming.balance import balance_of, explanations
+from crazyem.diagnosis.naming.evidence import usual_gusts
+from crazyem.diagnosis.naming.steady import with_baseline
 from crazyem.diagnosis.settings import FITTING
 from crazyem.recordings import open_recording
 from crazyem.recordings.recording import Recording

@@ -14,7 +14,7 @@ from simulator_files import PUBLISHED
 
 from crazyem.api.vehicles import check_vehicle, disagreements
 from crazyem.cli import main
-from crazyem.diagnosis.compare import compare
+from crazyem.diagnosis.document import compare
 from crazyem.recordings import open_recording
 from crazyem.simulators.convert import (
     FORMATS,

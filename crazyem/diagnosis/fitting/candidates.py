@@ -1,7 +1,7 @@
 """Candidates: each effect of the catalogue in each of its variants, as columns of the regression."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -99,10 +99,8 @@ class Candidate:
         of the small to the new amplitude.
         """
         base = {**self.neutral(point), **dict(self.begin)}
-        found = dict(base)
-        amplitude = CATALOGUE[self.effect].amplitude
+        amplitude, grown, ratio = CATALOGUE[self.effect].amplitude, None, 1.0
         moved = dict(zip(self.free, change, strict=True))
-        grown = None
         if amplitude in moved and amplitude in dict(self.begin):
             neutral = self.neutral(point)[amplitude]
             small = base[amplitude] - neutral
@@ -110,17 +108,12 @@ class Candidate:
             grown = neutral + moved[amplitude]
             if abs(moved[amplitude]) < 0.05 * abs(small) or not p.low <= grown <= p.high:
                 grown = base[amplitude]  # without amplitude, the others have no derivatives
-            found[amplitude] = grown
             ratio = small / (grown - neutral)
-        for name in self.free:
-            if name == amplitude and grown is not None:
-                continue
-            step = moved[name] * (ratio if grown is not None else 1.0)
-            found[name] = base[name] + step
-        for name in self.free:
-            low, high = self.range_of(name)
-            found[name] = min(max(found[name], low), high)
-        return found
+        found = {n: base[n] + step * ratio for n, step in moved.items()}
+        if grown is not None:
+            found[amplitude] = grown
+        ends = {n: self.range_of(n) for n in self.free}
+        return {**base, **{n: min(max(found[n], low), high) for n, (low, high) in ends.items()}}
 
 
 THRUST = Candidate(rotors.THRUST_SCALE.name, (), ("scale",))
@@ -199,16 +192,17 @@ def variants(effect: Effect, point: Point, signals: frozenset[str]) -> list[Cand
     """One candidate for each discrete choice, set of parameters and beginning."""
     chosen = [p for p in effect.parameters if p.chosen]
     continuous = [p.name for p in effect.parameters if not p.chosen and _fitted(p, signals)]
+    grid = ({**effect.nudge, **dict(zip(effect.beginnings, v))} for v in product(*effect.beginnings.values()))
+    begins = [tuple(values.items()) for values in grid]
     found = []
     for picks in product(*(p.chosen for p in chosen)):
         fixed = tuple(zip((p.name for p in chosen), picks, strict=True))
         if ("accelerometer",) in picks:
-            continue  # the accelerometer is compared by itself (accelerometer.py)
+            continue  # the accelerometer is compared by itself (`naming/other_likelihoods.py`)
         for free in effect.alternatives or (tuple(continuous),):
             if not all(name in continuous for name in free):
                 continue
-            for begin in _starting_values(effect):
-                found.append(Candidate(effect.name, fixed, tuple(free), begin))
+            found += [Candidate(effect.name, fixed, tuple(free), begin) for begin in begins]
     return found
 
 
@@ -216,11 +210,3 @@ def _fitted(parameter: Parameter, signals: frozenset[str]) -> bool:
     if parameter.needs and not any(s in signals for s in parameter.needs):
         return False
     return parameter.neutral is not None and parameter.scale > 0 and math.isfinite(parameter.scale)
-
-
-def _starting_values(effect: Effect) -> list[tuple[tuple[str, float], ...]]:
-    names = list(effect.beginnings)
-    grid: list[Mapping[str, float]] = [
-        dict(zip(names, values, strict=True)) for values in product(*(effect.beginnings[n] for n in names))
-    ]
-    return [tuple({**effect.nudge, **values}.items()) for values in grid]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import OWN, Column, Model, Point, Swept
-from crazyem.diagnosis.fitting.noise import CurvatureCache, coloured, fit_noise, without_negligible
+from crazyem.diagnosis.fitting.noise import Curvatures, coloured, fit_noise, without_negligible
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.settings import FITTING
 from crazyem.diagnosis.workers import Workers
@@ -53,7 +53,7 @@ class Data:
     def __init__(self, flights: Sequence[Flight], workers: Workers | None = None) -> None:
         self.models = [Model(f) for f in flights]
         self.workers = workers or Workers(1)
-        self.curvatures = CurvatureCache()
+        self.curvatures: Curvatures = {}
         self.constrained: frozenset[str] = frozenset()  # nuisances that are not free here
         self.own: Point | None = None  # of held-out flights: their noise and the start values of their nuisances
 
@@ -173,15 +173,8 @@ class Data:
 
     def gram_and_loglik(self, point: Point, columns: Sequence[Column]) -> tuple[Gram, float]:
         """Score and information of columns, and the log-likelihood."""
-        score, information, flight, loglik = [], [], [], 0.0
-        for i, swept in enumerate(
-            self.workers.map(lambda m: m.sweep(point, columns, workers=self.workers), self.models)
-        ):
-            score.append(swept.score)
-            information.append(swept.information)
-            flight.append(np.full(len(swept.score), i))
-            loglik += swept.loglik
-        return Gram(np.concatenate(score), np.concatenate(information), np.concatenate(flight)), loglik
+        swept = self.workers.map(lambda m: m.sweep(point, columns, workers=self.workers), self.models)
+        return Gram.joined(swept), sum(s.loglik for s in swept)
 
 
 def has_large_offset(name: str, values: Mapping[str, Any]) -> bool:

@@ -8,6 +8,7 @@ blocks (the sandwich; White 1982), not from the information alone.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,13 @@ class Gram:
     information: NDArray
     flight: NDArray
 
+    @classmethod
+    def joined(cls, parts: Sequence[Any]) -> "Gram":
+        """That of several flights, from parts with a `score` and an `information` by block."""
+        flight = [np.full(len(part.score), i) for i, part in enumerate(parts)]
+        score, information = ([getattr(part, name) for part in parts] for name in ("score", "information"))
+        return cls(np.concatenate(score), np.concatenate(information), np.concatenate(flight))
+
     @property
     def size(self) -> int:
         """Number of columns."""
@@ -50,11 +58,6 @@ class Gram:
     def moved(self, change: NDArray) -> "Gram":
         """Score and information after a small change (c,) of the parameters."""
         return replace(self, score=self.score - self.information @ change)
-
-    def fold_of(self) -> NDArray:
-        """(b,) fold of each block: chunks of blocks dealt out in turn."""
-        index = np.arange(self.score.shape[0])
-        return (index // FITTING.blocks_together) % FITTING.folds
 
     def total(self, columns: Sequence[int]) -> tuple[NDArray, NDArray]:
         """Sums over all blocks: (k,), (k, k)."""
@@ -90,7 +93,7 @@ class Gram:
         theta = bounded(a + np.diag(weight), b + weight * centre, low, high)
         gain = float(b @ theta - 0.5 * theta @ a @ theta - 0.5 * weight @ (theta - centre) ** 2)
         gain += float(0.5 * weight @ centre**2)
-        fold, held = self.fold_of(), 0.0
+        held, fold = 0.0, np.arange(len(scores)) // FITTING.blocks_together % FITTING.folds  # chunks dealt out in turn
         for f in range(FITTING.folds):
             out = fold == f
             if not out.any() or out.all():
@@ -139,8 +142,7 @@ class Gram:
         inverse = _inverse(a)
         freedom = max(blocks - (used(infos.sum(0), a) if effective else k), 2)
         sandwich = inverse @ meat @ inverse * blocks / freedom
-        plain = inverse
-        larger = np.sqrt(np.maximum(np.diag(sandwich), np.diag(plain)) / np.maximum(np.diag(sandwich), 1e-300))
+        larger = np.sqrt(np.maximum(np.diag(sandwich), np.diag(inverse)) / np.maximum(np.diag(sandwich), 1e-300))
         return sandwich * np.outer(larger, larger), meat
 
     @staticmethod

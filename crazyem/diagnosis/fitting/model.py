@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from crazyem.diagnosis.fitting import specific_force
-from crazyem.diagnosis.fitting.divergence import diverges
+from crazyem.diagnosis.fitting.noise import Noise, Swept, run_sweep
 from crazyem.diagnosis.fitting.situation import (
     causal_middle,
     impulses,
@@ -21,14 +21,50 @@ from crazyem.diagnosis.fitting.situation import (
     with_interpolated_states,
     with_rotors,
 )
-from crazyem.diagnosis.fitting.sweeps import Noise, Swept, run_sweep
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.settings import NOISE
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
-from crazyem.physics.effects.effect import Effects, Offset, Situation
+from crazyem.physics.effects.effect import Effect, Effects, Offset, Situation, Values
 from crazyem.physics.motion import measured, motion
 from crazyem.vehicle import Vehicle
+
+
+def diverges(flight: Flight, vehicle: Vehicle, name: str) -> bool:
+    """Whether a flight drives a hidden state into chaos: a small error of the measured path changes much of an effect's
+    force, from one of some beginnings."""
+    known = initial_path(flight)
+    off = known.copy()
+    off[:, 3:6] += NOISE.chaos_velocity * np.random.default_rng(0).normal(size=(len(off), 3))
+    thrusts = thrust_of(flight, vehicle, {})
+    paths = [situation_of(flight, path, vehicle, thrusts) for path in (known, off)]
+    free = [motion(there, vehicle=vehicle, effects={}).specific_force for there in paths]
+    for values in _some(CATALOGUE[name]):
+        pull, other = (
+            motion(there, vehicle=vehicle, effects={name: values}).specific_force - without
+            for there, without in zip(paths, free, strict=True)
+        )
+        swing = _rms(pull - pull.mean(axis=0))
+        if swing > NOISE.chaos_swing * _rms(pull) and _rms(other - pull) > NOISE.chaos_change * swing:
+            return True
+    return False
+
+
+def _some(effect: Effect) -> list[Values]:
+    """Values of an effect at one in `NOISE.chaos_every` of its beginnings; none for an effect without sizes."""
+    if not effect.sizes:
+        return []
+    size = effect.sizes[len(effect.sizes) // 2]
+    return [
+        {effect.amplitude: size, name: value}
+        for name, values in effect.beginnings.items()
+        for value in values[NOISE.chaos_every // 2 :: NOISE.chaos_every]
+    ]
+
+
+def _rms(values: NDArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
 
 # Prefix of the deviations of single recordings: "own:gyro_bias" -> {"FLIGHT/x": deviation}, added to the shared value
 # of the effect. Batteries and sensors change from day to day.
@@ -173,14 +209,14 @@ class Model:
         situation = with_rotors(self._path_situation, point.vehicle, thrusts)
         # only if the effect diverges: in other flights the path is enough, and `seen` contains the drift of attitudes
         if self.observed_force is not None and any(
-            _has_swing(name) and self.diverges(name, point.vehicle) for name in effects
+            CATALOGUE[name].tied is not None and self.diverges(name, point.vehicle) for name in effects
         ):
             situation = replace(situation, seen=self.observed_force, unrest=force_noise(point.noise))
         moved = motion(situation, vehicle=point.vehicle, effects=effects)
         return np.concatenate([moved.specific_force, moved.angular_acceleration], axis=1), situation
 
     def diverges(self, name: str, vehicle: Vehicle) -> bool:
-        """Whether the flight drives the state of an effect into chaos (`divergence.diverges`); stored."""
+        """Whether the flight drives the state of an effect into chaos (`diverges`); stored."""
         if name not in self._diverging:
             self._diverging[name] = diverges(self.flight, vehicle, name)
         return self._diverging[name]
@@ -395,10 +431,6 @@ def _in_order(swept: Swept, order: NDArray) -> Swept:
 def _changes_input(name: str) -> bool:
     effect = CATALOGUE[name]
     return effect.commanded is not None or effect.timing is not None or effect.speed is not None
-
-
-def _has_swing(name: str) -> bool:
-    return CATALOGUE[name].tied is not None
 
 
 def _changes_measurement(name: str) -> bool:

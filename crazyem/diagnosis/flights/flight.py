@@ -241,17 +241,14 @@ def without(recording: Recording, names: Sequence[str]) -> Recording:
     def hidden(name: str) -> bool:
         sources = [s.split("[")[0] for s in recording.signals[name].source]
         # the column pwr_pm_vbat of a CSV is pm.vbat of the firmware
-        return any(w == name or any(s.startswith(w) or _dotted(s).endswith(f".{w}") for s in sources) for w in names)
+        ends = [(s, "." + s.replace("_", ".")) for s in sources]
+        return any(w == name or any(s.startswith(w) or dotted.endswith(f".{w}") for s, dotted in ends) for w in names)
 
     for wanted in names:
         if not any(hidden(name) for name in recording.signals):
             known = ", ".join(sorted(recording.signals))
             raise DataError(f"{recording.path}: there is no signal '{wanted}' to withhold (there are {known})")
     return replace(recording, signals={n: a for n, a in recording.signals.items() if not hidden(n)})
-
-
-def _dotted(source: str) -> str:
-    return "." + source.replace("_", ".")
 
 
 def _nodes(times: Sequence[NDArray], airborne: Sequence[tuple[float, float]]) -> NDArray:

@@ -84,26 +84,19 @@ def units_of(point: Point) -> NDArray:
 
 def axis_columns(flight: Flight, weights: NDArray | None = None) -> list[Column]:
     """Columns of a unit acceleration on each of the six axes, times weights (n,)."""
-    n = flight.time.size
-    w = np.ones(n) if weights is None else weights
-    columns = []
-    for i in range(6):
-        acting = np.zeros((n, 6))
-        acting[:, i] = w
-        columns.append(Column(f"axis{i}", acting=acting))
-    return columns
+    return [Column(f"axis{i}", acting=acting) for i, acting in enumerate(_units(flight, weights, 6))]
 
 
 def shown_columns(flight: Flight, weights: NDArray | None = None) -> list[Column]:
     """Columns of a unit error of measured velocity, attitude and rate, times weights (n,)."""
-    n = flight.time.size
-    w = np.ones(n) if weights is None else weights
-    columns = []
-    for i in range(3, 12):
-        showing = np.zeros((n, 12))
-        showing[:, i] = w
-        columns.append(Column(f"shown{i}", showing=showing))
-    return columns
+    return [Column(f"shown{i}", showing=showing) for i, showing in enumerate(_units(flight, weights, 12)[3:], 3)]
+
+
+def _units(flight: Flight, weights: NDArray | None, axes: int) -> list[NDArray]:
+    """For each axis an array (n, axes) with the weights (n,), or ones, on this axis alone."""
+    found = np.zeros((axes, flight.time.size, axes))
+    found[np.arange(axes), :, np.arange(axes)] = 1.0 if weights is None else weights
+    return list(found)
 
 
 def world_columns(rotation: NDArray) -> list[Column]:
@@ -165,9 +158,7 @@ def _one(model: Model, point: Point, workers: Workers) -> tuple[list[Finding], D
     dispersion = _dispersion(b, a)
     times = np.array([flight.time[flight.block == i].mean() for i in range(flight.blocks)])
     findings = []
-    for i in range(len(constant)):
-        if i >= 6 and i not in (9, 10, 11):
-            continue
+    for i in (*range(6), 9, 10, 11):
         findings += _constant_and_change(i, b[:, i], a[:, i], dispersion[i], flight, times, unit[i])
     path = model.rows_path if model.rows_path is not None else swept.filtered
     room = model.sweep(point, world_columns(rotation_matrix(path[:, 6:10])))
@@ -220,13 +211,8 @@ def _dispersion(b: NDArray, a: NDArray) -> NDArray:
 
 
 def _signal(i: int) -> tuple[str, str, str]:
-    if i < 3:
-        return "force", AXES[i], "N"
-    if i < 6:
-        return "torque", AXES[i - 3], "N m"
-    if i < 9:
-        return "velocity", AXES[i - 6], "m/s"
-    return "attitude", AXES[i - 9], "rad"
+    signal, unit = (("force", "N"), ("torque", "N m"), ("velocity", "m/s"), ("attitude", "rad"))[i // 3]
+    return signal, AXES[i % 3], unit
 
 
 def _constant_and_change(

@@ -1,4 +1,4 @@
-"""The answer of a diagnosis: effects with intervals and confidence, look-alikes, and advice to separate them."""
+"""The answer of a diagnosis: effects with intervals and confidence, look-alikes, advice, and estimated nuisances."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,17 +13,128 @@ from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import error_by_lag, solved, systematic_sd
-from crazyem.diagnosis.naming.balance import Balance, log_odds_by_balance, rotor_loss
+from crazyem.diagnosis.naming.alternatives import LOAD, WEAKER, load_substitutes
+from crazyem.diagnosis.naming.balance import Balance, decided_by_balance, log_odds_by_balance, rotor_loss
 from crazyem.diagnosis.naming.balance import steady as steadily
-from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, load_substitutes
-from crazyem.diagnosis.naming.named import Named, Value, confidence_factor, one_factor
-from crazyem.diagnosis.naming.steady_odds import decided_by_balance
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, preferred
 from crazyem.diagnosis.naming.unexplained import Unexplained
-from crazyem.diagnosis.settings import LOADS, SELECTION
+from crazyem.diagnosis.settings import CONFIDENCE, LOADS, SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.mass_properties import ON_BOARD
 from crazyem.physics.effects.rotors import ROTOR_FAULT
+
+
+@dataclass(frozen=True)
+class Value:
+    """An estimated parameter: value and sd in `unit`, ci95 (low, high)."""
+
+    value: float
+    unit: str
+    sd: float
+    ci95: tuple[float, float]
+
+    @classmethod
+    def normal(cls, value: float, unit: str, sd: float) -> "Value":
+        """With the 95 % interval of a normal distribution."""
+        return cls(value, unit, sd, (value - 1.96 * sd, value + 1.96 * sd))
+
+
+@dataclass(frozen=True)
+class Named:
+    """An effect that was found.
+
+    Attributes:
+        name: in the catalogue; `label` with its choices.
+        parameters: the fitted ones; `chosen`: the searched ones.
+        held_out_nats: gain of log-likelihood on held-out flights.
+        confidence: probability that this effect is real, and not one of its look-alikes.
+        fitted_as: the effect as which it was fitted; "": by its own name.
+        log_odds: log posterior odds of the effect, look-alikes aside; None: not known.
+    """
+
+    name: str
+    label: str
+    parameters: dict[str, Value]
+    chosen: dict[str, object]
+    held_out_nats: float
+    confidence: float
+    fitted_as: str = ""
+    log_odds: float | None = None
+
+    @property
+    def words(self) -> str:
+        """The effect in words, with its choices."""
+        values = {**self.chosen, **{n: v.value for n, v in self.parameters.items()}}
+        return CATALOGUE[self.name].description(values)
+
+    @property
+    def of_recording(self) -> bool:
+        """Whether it belongs to the recording and not to the drone."""
+        return CATALOGUE[self.name].belongs_to == "recording"
+
+
+def confidence_factor(remains: Unexplained, held_out_nats: float = 0.0) -> float:
+    """Factor on the probability of an effect beside unexplained structure: the right model leaves none.
+
+    Physics outside the catalogue imitates effects of about its own size. An effect with a far larger held-out gain,
+    over the dispersion of its scores, is no such imitation.
+    """
+    if not remains.found:
+        return 1.0
+    times = max(held_out_nats, 0.0) / max(remains.nats, 1e-9)
+    return max(CONFIDENCE.doubtful, times**2 / (times**2 + CONFIDENCE.outweighs**2))
+
+
+def one_factor(values: NDArray, neutral: NDArray, covariance: NDArray) -> bool:
+    """Whether values (k,) with a covariance (k, k) are the neutral values times one factor, by chi-squared at 5 %.
+
+    Inertias with one factor about all three axes give the same signals as a factor on the torques.
+    """
+    ratio = np.log(values / neutral)
+    precision = np.linalg.pinv(covariance / np.outer(values, values))
+    mean = (precision @ ratio).sum() / precision.sum()
+    distance = float((ratio - mean) @ precision @ (ratio - mean))
+    return bool(stats.chi2.sf(distance, len(values) - 1) > 0.05)
+
+
+@dataclass(frozen=True)
+class Free:
+    """A nuisance, in `unit`; an entry of the JSON document (docs/reference/json.md).
+
+    Attributes:
+        name, words: its effect, in the catalogue and for people.
+        parameter: of this effect; or a recording, where each recording has its own value.
+        value, sd: estimate and standard deviation.
+        expected, usual: mean and standard deviation of its prior.
+    """
+
+    name: str
+    words: str
+    parameter: str
+    value: float
+    sd: float
+    unit: str
+    expected: float
+    usual: float
+
+
+def left_free(fitted: Fitted) -> tuple[Free, ...]:
+    """The nuisances of the final fit, in the order of its columns."""
+    if not fitted.nuisances:
+        return ()
+    variance = np.diag(solved(fitted)[0].covariance)
+    at, found = sum(len(c.free) for c in fitted.candidates), []
+    for candidate in fitted.nuisances:
+        values, expected = candidate.values(fitted.point), candidate.neutral(fitted.point)
+        words = CATALOGUE[candidate.effect].description({}) if candidate.effect in CATALOGUE else candidate.label
+        for name in candidate.free:
+            p, sd = candidate.parameter(name), max(variance[at], 0.0) ** 0.5
+            usual = fitted.precision[at] ** -0.5 if fitted.precision[at] > 0.0 else math.inf
+            value, middle = float(values[name]), float(expected[name])
+            found.append(Free(candidate.effect, words, p.description, value, float(sd), p.unit, middle, float(usual)))
+            at += 1
+    return tuple(found)
+
 
 # A thrust scale gives the same signals as two changes, mass and inertias by one factor, except for forces of the air.
 HEAVIER = "weigh the drone: with {:.3g} times its mass and its inertias it would fly the same"
@@ -57,7 +168,7 @@ def answer_of(
     Args:
         remains: unexplained structure; beside it no effect is sure.
         corroborated: names that another signal separates from their look-alikes.
-        in_place: effect -> its trial and the trial of its substitute (`load_or_rotors`).
+        in_place: effect -> its trial and the trial of its substitute (`alternatives.py`).
         balance: steady thrust and torque, which separates effects where a file has a trim.
     """
     if not selection.accepted:

@@ -5,29 +5,42 @@ torque and drag torque in one ratio, and a load has no torque about z. Differenc
 The filter's likelihood is overconfident of steady parts: its scores scatter up to 13 times as much as the model says,
 so the prior of a day has no weight beside it. So the four steady numbers are fitted without any effect, and are judged
 here by their covariance from day to day.
+
+The balances of all flights give the posterior odds of a weak rotor or a load on board. Both are the same in all
+flights; the trim of a day is not. The trim is free in the filter's likelihood, with heavy tails (`Prior.freedom`), so
+this likelihood says little of steady effects.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.optimize import lsq_linear, minimize_scalar
+from scipy.optimize import lsq_linear, minimize, minimize_scalar
+from scipy.special import logit, logsumexp
 
 from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate
-from crazyem.diagnosis.fitting.days import day_freedom, day_sd
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, refine
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.nuisances import nuisances, solved, with_nuisances
+from crazyem.diagnosis.fitting.nuisances import (
+    day_freedom,
+    day_sd,
+    nuisances,
+    refine_base,
+    solved,
+    trim_known,
+    with_nuisances,
+)
 from crazyem.diagnosis.naming.alternatives import with_replacement
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
-from crazyem.diagnosis.settings import LOADS, SELECTION
+from crazyem.diagnosis.settings import CONFIDENCE, LOADS, SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.mass_properties import ON_BOARD, PAYLOAD
 from crazyem.physics.effects.rotors import ROTOR_FAULT
 from crazyem.physics.rotors import wrench
+from crazyem.vehicle import Vehicle
 
 # `Effect.imbalance` -> number of parameters that count. A rotor moves all four numbers in one ratio; a load moves three
 # within the bounds of its place.
@@ -126,14 +139,9 @@ def steady(candidate: Candidate) -> bool:
     return dict(candidate.fixed).get("onset_time") is None
 
 
-def _unbalances(candidate: Candidate) -> bool:
-    """Whether the influence of the effect on the balance is known."""
-    return bool(CATALOGUE[candidate.effect].imbalance)
-
-
-def _numbers(candidate: Candidate) -> int:
-    """Number of parameters that count for the effect (`FREE`)."""
-    return FREE[CATALOGUE[candidate.effect].imbalance]
+def _kind(candidate: Candidate) -> str:
+    """The influence of an effect on the balance; "" if it is not known."""
+    return CATALOGUE[candidate.effect].imbalance
 
 
 def rotor_loss(balance: Balance, rotor: int) -> tuple[float, float]:
@@ -148,7 +156,7 @@ def hidden_by_daily_variation(data: Data, selection: Selection, asked: Sequence[
 
     Empty without a trim in the file, with a steady effect, or if weak rotors were not among the candidates `asked`.
     """
-    steadied = TRIM in selection.nominal.vehicle.effects and not any(map(_unbalances, selection.accepted))
+    steadied = TRIM in selection.nominal.vehicle.effects and not any(map(_kind, selection.accepted))
     if not steadied or all(c.effect != ROTOR_FAULT.name for c in asked):
         return {}
     try:
@@ -174,9 +182,9 @@ def by_balance(data: Data, selection: Selection) -> tuple[Selection, Balance | N
     with a steady force or torque.
     """
     names = {c.effect for c in selection.accepted}
-    decided = {s.taken.candidate: s.taken.size for s in selection.steps if s.taken and s.taken.log_odds is not None}
+    decided = {t.candidate: t.size for t in selection.taken.values() if t.log_odds is not None}
     mine = next((c for c in selection.accepted if c in decided), None)
-    mine = mine or next((c for c in selection.accepted if _unbalances(c)), None)
+    mine = mine or next((c for c in selection.accepted if _kind(c)), None)
     single = mine in decided or (sum(bool(CATALOGUE[n].imbalance) for n in names) == 1 and TRIM not in names)
     if TRIM not in selection.nominal.vehicle.effects or mine is None or not single or not steady(mine):
         return selection, None
@@ -204,20 +212,19 @@ def _named(data: Data, selection: Selection, mine: Candidate, balance: Balance) 
         if nats is not None and trial.fitted is not None:
             rivals.append((nats, trial))
     beaten = [r for r in rivals if r[0] < -SELECTION.separating]
-    simpler = [r for r in rivals if r[0] < SELECTION.separating and _numbers(r[1].candidate) < _numbers(mine)]
+    simpler = [r for r in rivals if r[0] < SELECTION.separating and FREE[_kind(r[1].candidate)] < FREE[_kind(mine)]]
     if not beaten and not simpler:
         return selection, mine
     best = min(beaten or simpler, key=lambda entry: entry[0])[1]
-    return _instead(data, selection, step, mine, best), best.candidate
+    return _instead(data, selection, mine, best), best.candidate
 
 
-def _instead(data: Data, selection: Selection, step: Step, old: Candidate, trial: Trial) -> Selection:
+def _instead(data: Data, selection: Selection, old: Candidate, trial: Trial) -> Selection:
     """The selection with an effect replaced by another trial of the same turn."""
     assert trial.fitted is not None
     values = [float(trial.candidate.values(trial.fitted.point)[n]) for n in trial.candidate.free]
     found = with_replacement(data, selection, old, trial.candidate, values)
-    steps = tuple(replace(s, taken=trial) if s is step else s for s in selection.steps)
-    return replace(found, steps=steps)
+    return found.with_step(trial.candidate.effect, taken=trial)
 
 
 def _sized(data: Data, selection: Selection, candidate: Candidate, values: Mapping[str, float]) -> Selection:
@@ -228,3 +235,106 @@ def _sized(data: Data, selection: Selection, candidate: Candidate, values: Mappi
     fitted = refine(data, with_nuisances(there, free), rest, nuisances=free, rounds=4, noise=False)
     fitted = refine(data, fitted.point, selection.accepted, nuisances=free, rounds=0, noise=False)
     return replace(selection, final=fitted.point, fitted=fitted)
+
+
+Lack = Callable[[NDArray, Balance], NDArray]  # (numbers of an effect, balance) -> part of `lack` by the effect
+
+
+def _rotor(index: int) -> Lack:
+    return lambda x, balance: x[0] * balance.rotors[index]
+
+
+def _load(x: NDArray, balance: Balance) -> NDArray:
+    """Numbers of a load: share of the whole weight; lever arms about x and y, over the furthest place on board."""
+    return np.array([x[0], x[0] * ON_BOARD * x[1], x[0] * ON_BOARD * x[2], 0.0])
+
+
+def explanations(balances: Sequence[Balance]) -> dict[tuple[str, int], tuple[float, NDArray]]:
+    """(`Effect.imbalance`, rotor or 0) -> log posterior weight [nats] and numbers; ("", 0): no effect, only the days.
+
+    The weight is the log prior and the largest log-likelihood of all balances together, less one nat a number (`FREE`).
+    """
+    place = (-LOADS.max_place, LOADS.max_place)
+    asked: dict[tuple[str, int], tuple[Lack, list[tuple[float, float]]]] = {
+        **{("rotor", r): (_rotor(r - 1), [(0.0, 1.0)]) for r in (1, 2, 3, 4)},
+        ("load", 0): (_load, [(0.0, LOADS.max_load / (1.0 + LOADS.max_load)), place, place]),
+        ("thrust", 0): (lambda x, _: np.array([x[0], 0.0, 0.0, 0.0]), [(-1.0, 1.0)]),
+        ("air", 0): (lambda x, _: np.array([0.0, x[0], x[1], 0.0]), [(-ON_BOARD, ON_BOARD)] * 2),
+    }
+    roots = [np.linalg.cholesky(np.linalg.inv(b.covariance)).T for b in balances]
+
+    def loglik(moves: Callable[[Balance], NDArray]) -> float:
+        rest = [root @ (b.lack - moves(b)) for root, b in zip(roots, balances, strict=True)]
+        return sum(likely(float(r @ r), b.freedom) for r, b in zip(rest, balances, strict=True))
+
+    found = {("", 0): (np.log1p(-CONFIDENCE.file_lacks) + loglik(lambda b: np.zeros(4)), np.zeros(0))}
+    for (kind, rotor), (lack, ends) in asked.items():
+        starts = [np.array([0.1 * high, *(0.0 for _ in ends[1:])]) for high in (ends[0][1], 3.0 * ends[0][1])]
+        fits = [
+            minimize(lambda x, f=lack: -loglik(lambda b: f(x, b)), start, bounds=ends, method="L-BFGS-B")
+            for start in starts
+        ]
+        best = min(fits, key=lambda r: float(r.fun))
+        prior = np.log(CONFIDENCE.file_lacks / sum(k == kind for k, _ in asked))
+        found[kind, rotor] = (prior - float(best.fun) - FREE[kind], best.x)
+    return found
+
+
+def steady_selection(
+    data: Data, apart: Data | None, nominal: Point, asked: Sequence[Candidate], say: Callable[[str], None]
+) -> Selection | None:
+    """A selection that starts with a weak rotor or a load, if the balances of all flights make it probable.
+
+    None if its probability is less than `CONFIDENCE.min_probability`, or if the vehicle file has no known trim.
+    """
+    mine = [c for c in asked if decided_by_balance(nominal.vehicle, c)]
+    if not mine:
+        return None
+    try:
+        flights = [*data.each(), *(apart.each() if apart is not None else ())]
+        found = explanations([balance_of(one, nominal) for one in flights])
+        total = float(logsumexp([weight for weight, _ in found.values()]))
+        chance = {name: float(np.exp(weight - total)) for name, (weight, _) in found.items()}
+        best = max(chance, key=lambda name: chance[name])
+        candidate = next((c for c in mine if _is(c, best)), None)
+        if candidate is None or chance[best] < CONFIDENCE.min_probability:
+            return None
+        say(f"by what is steady in all flights: {candidate.label} with {chance[best]:.2f}")
+        before = refine_base(data.twin(), nominal, ())
+        size = _values(candidate, found[best][1], nominal)
+        start = nominal.with_effects({candidate.effect: size})
+        fitted = refine_base(data, start, [candidate])
+    except (DivergedError, np.linalg.LinAlgError):  # `hidden_by_the_day` reports this
+        say("what is steady in these flights fits no model: neither a weak rotor nor a load is asked for")
+        return None
+    odds = float(logit(min(chance[best], 1.0 - 1e-12)))
+    gain = fitted.loglik - before.loglik
+    trial = Trial(candidate, gain, max(odds, 0.0), 1.0, odds, fitted, admissible=True, log_odds=odds, size=size)
+    alike = tuple(
+        replace(trial, candidate=other, fitted=None)
+        for other in asked
+        if other.effect != candidate.effect
+        and any(_is(other, name) and p > CONFIDENCE.min_look_alike for name, p in chance.items())
+    )
+    step = Step((trial, *alike), trial, alike)
+    return Selection(before.point, fitted.point, (step,), (candidate,), fitted)
+
+
+def decided_by_balance(vehicle: Vehicle, candidate: Candidate) -> bool:
+    """Whether the balance alone decides on a candidate: a weak rotor or a load, if the vehicle's trim is known."""
+    return trim_known(vehicle) and CATALOGUE[candidate.effect].imbalance in ("rotor", "load") and steady(candidate)
+
+
+def _is(candidate: Candidate, name: tuple[str, int]) -> bool:
+    kind, rotor = CATALOGUE[candidate.effect].imbalance, dict(candidate.fixed).get("rotor", 0)
+    return bool(kind) and (kind, rotor) == name and steady(candidate)
+
+
+def _values(candidate: Candidate, numbers: NDArray, point: Point) -> Mapping[str, float]:
+    """Parameters of the effect from its numbers in `explanations`."""
+    values = candidate.neutral(point)
+    if CATALOGUE[candidate.effect].imbalance == "rotor":
+        return {**values, "scale": 1.0 - float(numbers[0])}
+    mass = point.vehicle.mass * float(numbers[0]) / (1.0 - float(numbers[0]))
+    # torque of a load at (x, y) over its weight: -y about x, x about y
+    return {**values, "mass": mass, "x": ON_BOARD * float(numbers[2]), "y": -ON_BOARD * float(numbers[1])}

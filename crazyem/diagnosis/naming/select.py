@@ -14,7 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
-from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, freedom_of, local_precision, nuisance_bounds
+from crazyem.diagnosis.fitting.fit import (
+    Data,
+    DivergedError,
+    Fitted,
+    bounds_of,
+    freedom_of,
+    local_precision,
+    nuisance_bounds,
+)
 from crazyem.diagnosis.fitting.gram import Solution, neutral_gain
 from crazyem.diagnosis.fitting.model import Column, Point
 from crazyem.diagnosis.fitting.nuisances import (
@@ -29,13 +37,11 @@ from crazyem.diagnosis.fitting.nuisances import (
     with_nuisances,
     without,
 )
-from crazyem.diagnosis.naming.detection_limits import exceeds_limit
-from crazyem.diagnosis.naming.evidence import accepted_covariance, joint_gain, occam_cost
-from crazyem.diagnosis.naming.onset import extend, onset_of
+from crazyem.diagnosis.naming.balance import decided_by_balance
+from crazyem.diagnosis.naming.evidence import accepted_covariance, exceeds_limit, joint_gain, occam_cost
 from crazyem.diagnosis.naming.prune import pruned
-from crazyem.diagnosis.naming.starting_points import best_starting_points
+from crazyem.diagnosis.naming.starting_points import best_starting_points, extend, onset_of
 from crazyem.diagnosis.naming.steady import steady_rivals, without_trim_rivals
-from crazyem.diagnosis.naming.steady_odds import decided_by_balance
 from crazyem.diagnosis.naming.trials import (
     Selection,
     Step,
@@ -75,8 +81,7 @@ def linear_trials(
         columns += added
     gram = data.gram(point, columns)
     always = [i for group in index[: len(base)] for i in group]
-    wide_low = np.array([b for c in base for b in c.bounds(point)[0]])
-    wide_high = np.array([b for c in base for b in c.bounds(point)[1]])
+    wide_low, wide_high = bounds_of(base, point)
     away = [c.neutral(point)[n] - c.values(point)[n] for c, _ in free for n in c.free]
     centre = np.array([0.0 for c in accepted for _ in c.free] + away)
     freedom = np.append(np.full(len(centre) - len(away), np.inf), freedom_of([c for c, _ in free]))
@@ -154,11 +159,18 @@ class Basis:
 def fitted_trial(basis: Basis, trial: Trial, solution: Solution, *, say: Callable[[str], None]) -> Trial:
     """The trial after a full fit; the basis stays as it is."""
     basis = constrained_basis(basis, trial.candidate)
-    point = basis.point
     say(f"  fitting {trial.candidate.label}")
+    return _refitted(basis, trial, at_linear_size(basis.point, trial.candidate, solution), noise=False)
+
+
+def _refitted(basis: Basis, trial: Trial, start: Point, *, noise: bool) -> Trial:
+    """The trial after a fit from a start, with its own noise scales or not; unfitted where the fit diverges."""
     data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
     try:
-        fit = refine_base(data, at_linear_size(point, trial.candidate, solution), mine, rounds=3, noise=False)
+        if noise:
+            fit = refine_with_memory(data, start, mine, rounds=3)
+        else:
+            fit = refine_base(data, start, mine, rounds=3, noise=False)
         return compared(basis, trial, data, fit)
     except DivergedError:  # the linear approximation went too far
         return trial
@@ -188,13 +200,7 @@ def with_held_out_by(basis: Basis, trial: Trial) -> Basis:
 def with_noise_refit(basis: Basis, trial: Trial) -> Trial:
     """A trial with its own noise scales: those of the model before it contain the effect, and hide the gain."""
     assert trial.fitted is not None
-    basis = constrained_basis(basis, trial.candidate)
-    data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
-    try:
-        fit = refine_with_memory(data, trial.fitted.point, mine, rounds=3)
-        return compared(basis, trial, data, fit)
-    except DivergedError:
-        return trial
+    return _refitted(constrained_basis(basis, trial.candidate), trial, trial.fitted.point, noise=True)
 
 
 def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
@@ -327,8 +333,8 @@ def select(
             candidates = [c for c in candidates if c.effect != taken.candidate.effect]
             data.settle(fitted.point)
             continue
-        accepted, fitted = list(extension.fitted.candidates), extension.fitted
-        point, value, apart, held_value = fitted.point, fitted.loglik, extension.held_out, extension.held_value
+        fitted, apart, held_value = extension
+        accepted, point, value = list(fitted.candidates), fitted.point, fitted.loglik
         if is_nonphysical(point, accepted):  # `diagnose` reports that
             return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, reasons)
     found = {c.effect for c in accepted}

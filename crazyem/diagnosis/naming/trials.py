@@ -1,8 +1,9 @@
-"""Effects that were tried, and how two of them are compared: evidence, posterior odds, what cannot be told apart."""
+"""Effects that were tried: evidence, probability that they are real, and comparison of two of them."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,51 @@ from scipy.special import expit, logit
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Fitted
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.naming.presence import presence
 from crazyem.diagnosis.settings import CONFIDENCE, FITTING, SELECTION
+
+
+def presence(gain: float, held_out: float, expected: float, order: int = 1, *, dispersion: float = 1.0) -> float:
+    """Probability that an effect is real, look-alikes aside.
+
+    Args:
+        gain: on the fitted flights, or on the held-out ones if it is larger there, over the dispersion [nats].
+        held_out: gain on the held-out flights [nats].
+        expected: mean of `held_out` for a real effect [nats].
+        order: 1 for the first effect that was found, 2 for the next.
+        dispersion: variance of the effect's scores over that of the model.
+    """
+    if gain <= 0.0:
+        return 0.0
+    odds = CONFIDENCE.intercept + CONFIDENCE.gain_power * math.log1p(gain) - CONFIDENCE.order_power * math.log(order)
+    return min(CONFIDENCE.max_probability, float(expit(odds + held_out_evidence(held_out, expected, dispersion))))
+
+
+def held_out_evidence(held_out: float, expected: float, dispersion: float = 1.0) -> float:
+    """Log-odds of an effect by its gain on held-out flights.
+
+    A log-likelihood ratio of mean m has a variance of 2 m. With m = 0 the flights say nothing. A gain beyond m or -m
+    counts as m or -m.
+    """
+    expected = max(expected, 0.0)
+    noise = 1.0 + 2.0 * dispersion * expected
+    there, elsewhere = (
+        math.sqrt(noise + (share * expected) ** 2) for share in (CONFIDENCE.real_sd, CONFIDENCE.other_sd)
+    )
+    held_out = min(max(held_out, -expected), expected)
+    density = stats.t(CONFIDENCE.freedom).logpdf
+    return float(density((held_out - expected) / there) - density(held_out / elsewhere) + math.log(elsewhere / there))
+
+
+def presence_by_odds(nats: float) -> float:
+    """Probability of an effect by a likelihood that contains the systematic errors of its model: nats are log-odds."""
+    return min(CONFIDENCE.max_probability, float(expit(nats + logit(CONFIDENCE.file_lacks))))
+
+
+def improbable(chance: float) -> str:
+    """Reason why an effect of this probability is no finding; "" if it is one."""
+    if chance >= CONFIDENCE.min_probability:
+        return ""
+    return f"not determined: the flights make it probable with {chance:.2g} only"
 
 
 @dataclass(frozen=True)
@@ -35,7 +79,7 @@ class Trial:
             nuisances are part of it.
         recording: (b,) int, the recording of each block.
         parameter_cost: nats that the width of its prior costs (`evidence.occam_cost`); None: one nat a parameter.
-        log_odds: log posterior odds of the effect, where the balance of the flights gives them (`steady_odds.py`).
+        log_odds: log posterior odds of the effect, where the balance of the flights gives them (`balance.py`).
         size: the parameters that these odds are of.
         other_evidence: nats of signals that the filter does not use.
         constrained: nuisances that are not free in the model without the effect, since they could stand for it.
@@ -127,18 +171,20 @@ class Selection:
     fitted: Fitted
     left_out: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def taken(self) -> dict[str, Trial]:
+        """The trials whose effects joined the model, by effect, in the order of their selection."""
+        return {s.taken.candidate.effect: s.taken for s in self.steps if s.taken}
+
     def orders(self) -> list[int]:
         """The rank of each selected effect in the order of their selection (from 1); a trim is not counted."""
-        names = [s.taken.candidate.effect for s in self.steps if s.taken]
+        names = list(self.taken)
         return [1 + sum(n != TRIM for n in names[:k]) for k in range(len(names))]
 
-    def with_evidence(self, candidate: Candidate, nats: float) -> "Selection":
-        """With so many nats of another likelihood for a selected effect; its look-alikes are gone."""
-        steps = list(self.steps)
-        for k, step in enumerate(steps):
-            if step.taken is not None and step.taken.candidate.effect == candidate.effect:
-                steps[k] = replace(step, taken=replace(step.taken, other_evidence=nats), alike=())
-        return replace(self, steps=tuple(steps))
+    def with_step(self, effect: str, **changes: Any) -> "Selection":
+        """With changes of the turn in which an effect joined the model."""
+        mine = (s.taken and s.taken.candidate.effect == effect for s in self.steps)
+        return replace(self, steps=tuple(replace(s, **changes) if m else s for s, m in zip(self.steps, mine)))
 
 
 def margin(best: Trial, other: Trial) -> tuple[float, float]:

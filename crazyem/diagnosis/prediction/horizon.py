@@ -51,21 +51,6 @@ class HorizonErrors:
         return found
 
 
-@dataclass(frozen=True)
-class Worse:
-    """A quantity that a model predicts significantly worse than the model before: at a horizon [s], by a number of
-    standard errors (inf if the model left the range of numbers)."""
-
-    quantity: str
-    horizon: float
-    standard_errors: float
-
-    def to_json(self) -> dict[str, Any]:
-        """For the result document."""
-        sigmas = self.standard_errors if math.isfinite(self.standard_errors) else None
-        return {"quantity": self.quantity, "horizon_s": self.horizon, "standard_errors": sigmas}
-
-
 @dataclass(frozen=True, eq=False)
 class Windows:
     """Starts and ends of open-loop runs along a flight; the same for every model.
@@ -88,7 +73,6 @@ def windows(
     *,
     horizons: Sequence[float] = HORIZONS,
     spacing: float = PREDICTION.spacing,
-    within: Sequence[tuple[float, float]] | None = None,
 ) -> Windows:
     """The starts of open-loop runs and the recorded states at their ends.
 
@@ -96,12 +80,12 @@ def windows(
         shown: the recording.
         horizons: s, increasing.
         spacing: s from start to start.
-        within: intervals [s] that must contain a run, beside the flights; None: the flights alone.
 
     Raises: DataError if there is no such run.
     """
-    parts = [_rows_between(shown, a, b, horizons[-1], spacing) for a, b in _common(shown.flights, within)]
-    rows = np.concatenate([np.empty(0, np.int64), *parts])
+    firsts = [np.arange(begin, end - horizons[-1] - 1e-9, spacing) for begin, end in shown.flights]
+    parts = [np.unique(np.searchsorted(shown.time, first - 1e-9)) for first in firsts]
+    rows = np.concatenate([np.empty(0, np.int64), *(rows[rows < shown.time.size] for rows in parts)])
     ends = shown.time[rows][:, None] + np.asarray(horizons)
     at = np.clip(np.searchsorted(shown.time, ends), 1, shown.time.size - 1)
     at -= (ends - shown.time[at - 1]) < (shown.time[at] - ends)
@@ -177,8 +161,11 @@ def errors(prediction: NDArray, at: Windows) -> HorizonErrors:
     return HorizonErrors(at.horizons, len(at.rows), rms, mean)
 
 
-def worse(pairs: Sequence[tuple[Mapping[str, NDArray], Mapping[str, NDArray]]]) -> tuple[Worse, ...]:
+def worse(pairs: Sequence[tuple[Mapping[str, NDArray], Mapping[str, NDArray]]]) -> list[dict[str, Any]]:
     """Quantities that one model predicts visibly and significantly worse than another, over the same windows.
+
+    Entries of the result document: quantity, horizon [s], and by how many standard errors (None if the model left the
+    range of numbers).
 
     Args:
         pairs: `error_lengths` (n, h) of the model before and after, one pair a flight, at `HORIZONS` from starts every
@@ -192,8 +179,9 @@ def worse(pairs: Sequence[tuple[Mapping[str, NDArray], Mapping[str, NDArray]]]) 
             grown = [after - before for before, after in squares]
             sigmas = _standard_errors(grown, max(1, math.ceil(horizon / PREDICTION.spacing - 1e-9)))
             if sigmas > PREDICTION.beyond_chance and _mean(second) > PREDICTION.min_ratio**2 * _mean(first):
-                found.append(Worse(name, horizon, sigmas))
-    return tuple(found)
+                [size] = _plain([sigmas])
+                found.append({"quantity": name, "horizon_s": horizon, "standard_errors": size})
+    return found
 
 
 def _standard_errors(differences: Sequence[NDArray], overlapping: int) -> float:
@@ -209,14 +197,6 @@ def _standard_errors(differences: Sequence[NDArray], overlapping: int) -> float:
         return 0.0
     error = float(np.std(means, ddof=1)) / math.sqrt(len(means))
     return float(np.mean(means)) / error if error > 0.0 else 0.0
-
-
-def horizon_errors(
-    shown: Recorded, *, effects: Effects | None = None, vehicle: Vehicle | None = None, at: Windows | None = None
-) -> HorizonErrors:
-    """Errors of a model along a recording, at 10, 100 and 500 ms unless `at` says otherwise. Raises as `windows`."""
-    at = windows(shown) if at is None else at
-    return errors(open_loop(shown, at, vehicle=vehicle, effects=effects), at)
 
 
 def lengths(prediction: NDArray, truth: NDArray, *, attitude: bool) -> NDArray:
@@ -236,18 +216,10 @@ def recorded_at(shown: Recorded, time: NDArray) -> NDArray:
         if when.size < 2:
             continue
         after = np.clip(np.searchsorted(when, time - 1e-9), 1, when.size - 1)
-        before = after - 1
-        gap = when[after] - when[before]
-        share = np.clip((time - when[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)[:, None]
-        first, second = value[before], value[after]
-        if name == "attitude":
-            second = np.where(np.sum(first * second, axis=1, keepdims=True) < 0, -second, second)
-        mixed = (1 - share) * first + share * second
-        if name == "attitude":
-            mixed = mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
+        before, mixed = after - 1, _interpolated(when, value, time, after)
         there = np.minimum(np.abs(time - when[before]), np.abs(time - when[after])) < 1e-6
         inside = (
-            (gap <= PREDICTION.max_period)
+            (when[after] - when[before] <= PREDICTION.max_period)
             & (time >= when[before] - RECORDINGS.same_time)
             & (time <= when[after] + RECORDINGS.same_time)
         )
@@ -259,29 +231,20 @@ def recorded_at(shown: Recorded, time: NDArray) -> NDArray:
 def recorded_attitude(shown: Recorded, time: NDArray) -> tuple[NDArray, NDArray]:
     """Attitude (n, 4) and body rate (n, 3) at (n,) s, interpolated between samples of any distance."""
     when, value = shown.parts["attitude"]
-    after = np.clip(np.searchsorted(when, time), 1, when.size - 1)
-    first, second = value[after - 1], value[after]
-    second = np.where(np.sum(first * second, axis=1, keepdims=True) < 0, -second, second)
-    share = np.clip((time - when[after - 1]) / np.maximum(when[after] - when[after - 1], 1e-9), 0.0, 1.0)[:, None]
-    mixed = (1 - share) * first + share * second
+    attitude = _interpolated(when, value, time, np.clip(np.searchsorted(when, time), 1, when.size - 1))
     when, rate = shown.parts["body_rate"]
-    rates = np.stack([np.interp(time, when, rate[:, c]) for c in range(3)], axis=1)
-    return mixed / np.linalg.norm(mixed, axis=1, keepdims=True), rates
+    return attitude, np.stack([np.interp(time, when, rate[:, c]) for c in range(3)], axis=1)
 
 
-def _rows_between(shown: Recorded, begin: float, end: float, longest: float, spacing: float) -> NDArray:
-    first = np.arange(begin, end - longest - 1e-9, spacing)
-    rows = np.searchsorted(shown.time, first - 1e-9)
-    return np.unique(rows[rows < shown.time.size])
-
-
-def _common(
-    flights: Sequence[tuple[float, float]], within: Sequence[tuple[float, float]] | None
-) -> list[tuple[float, float]]:
-    if within is None:
-        return list(flights)
-    pairs = [(max(a, c), min(b, d)) for a, b in flights for c, d in within]
-    return [(a, b) for a, b in pairs if b > a]
+def _interpolated(when: NDArray, value: NDArray, time: NDArray, after: NDArray) -> NDArray:
+    """Values (n, 3 or 4) at (n,) s between the samples before `after` (n,) and there; four columns are attitudes."""
+    first, second, gap = value[after - 1], value[after], when[after] - when[after - 1]
+    share = np.clip((time - when[after - 1]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)[:, None]
+    if value.shape[1] < 4:
+        return (1 - share) * first + share * second
+    second = np.where(np.sum(first * second, axis=1, keepdims=True) < 0, -second, second)
+    mixed = (1 - share) * first + share * second
+    return mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
 
 
 def _mean(values: NDArray) -> float:

@@ -46,7 +46,7 @@ class Recorded:
         inputs: inputs of the rotors.
         parts: recorded samples of position, velocity, attitude and body_rate: (k,) s and (k, 3 or 4), by name.
         flights: intervals in the air [s].
-        before: inputs with voltages estimated from the first part of the flight only (see `level`), in order of time,
+        before: inputs with voltages estimated from the first part of the flight only (`level_of`), in order of time,
             for early starts. Empty if the voltage is recorded.
     """
 
@@ -98,16 +98,8 @@ class Prediction:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All arrays by name, for a file."""
-        return {
-            "prediction": self.prediction,
-            "time": self.time,
-            "start_time": self.start_time,
-            "start_index": self.start_index,
-            "start_age": self.start_age,
-            "airborne": self.airborne,
-            "step": np.array(self.step),
-            "names": np.array(NAMES),
-        }
+        own = ("prediction", "time", "start_time", "start_index", "start_age", "airborne")
+        return {**{n: getattr(self, n) for n in own}, "step": np.array(self.step), "names": np.array(NAMES)}
 
     def to_dict(self) -> dict[str, Any]:
         """All results by name, ready for JSON: lists, and None for numbers that are not finite."""
@@ -193,14 +185,7 @@ def _state_signals(recording: Recording) -> dict[str, SignalArray]:
         array = next((recording.signals[n] for n in wanted if n in recording.signals), None)
         if array is None and name == "attitude" and "euler" in recording.signals:
             euler = recording.signals["euler"]
-            array = SignalArray(
-                euler.time,
-                quaternion_from_euler(*euler.value.T),
-                euler.order,
-                euler.host_time,
-                euler.marked,
-                "attitude",
-            )
+            array = replace(euler, value=quaternion_from_euler(*euler.value.T), quantity="attitude")
         if array is not None and array.time.size:
             found[name] = array
     missing = [name for name in COLUMNS if name not in found]

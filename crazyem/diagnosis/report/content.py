@@ -4,12 +4,27 @@ It is made from the diagnosis' JSON document alone, so that anyone can write the
 its part.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from crazyem.diagnosis.report.quantities import items, number, per_cent, quantity, short, span, table, tables
-from crazyem.diagnosis.report.verdict import QUANTITIES, Document, alike, effect_words, spaced, words_of
+from crazyem.diagnosis.report.verdict import (
+    QUANTITIES,
+    Document,
+    alike,
+    effect_words,
+    items,
+    number,
+    per_cent,
+    quantity,
+    short,
+    spaced,
+    span,
+    table,
+    tables,
+    verdict,
+    words_of,
+)
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 MOST_RANKED = 12
@@ -42,20 +57,6 @@ class Bar:
 
 
 @dataclass(frozen=True)
-class Meter:
-    """A share, 0 to 100 %."""
-
-    per_cent: float
-
-
-@dataclass(frozen=True)
-class Text:
-    """A paragraph."""
-
-    text: str
-
-
-@dataclass(frozen=True)
 class Items:
     """A list; `warn` marks a reservation."""
 
@@ -66,7 +67,7 @@ class Items:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of texts, `Cell`, `Bar` or `Meter`; `right` are columns of numbers."""
+    """Rows of texts, `Cell`, `Bar` or a share in per cent; `right` are columns of numbers."""
 
     heads: tuple[str, ...]
     rows: tuple[tuple[Any, ...], ...]
@@ -79,7 +80,7 @@ class Section:
     """A part of a report; `pictures`: the `Series.section` of its pictures; `page`: for the page alone."""
 
     title: str
-    parts: tuple[Text | Items | Table, ...]
+    parts: tuple[str | Items | Table, ...]
     pictures: str = ""
     page: bool = False
 
@@ -107,7 +108,7 @@ def facts(document: Document) -> list[tuple[str, str]]:
     return found
 
 
-def _effects(document: Document) -> list[Text | Table]:
+def _effects(document: Document) -> list[str | Table]:
     rows: list[tuple[Any, ...]] = []
     for effect in tables(document.get("effects")):
         sure, held = number(effect.get("confidence")), table(effect.get("evidence")).get("held_out_nats")
@@ -122,9 +123,9 @@ def _effects(document: Document) -> list[Text | Table]:
         if begin[0]:
             rows.append((*begin, "", "", "", ""))
     if not rows:
-        return [Text("None of the effects of the catalogue is claimed.")]
+        return ["None of the effects of the catalogue is claimed."]
     heads = ("effect", "probability", "gain held out", "parameter", "value", "95 % interval", "against none")
-    return [Table(heads, tuple(rows), (1, 2, 4, 5)), Text(LIKELIHOOD)]
+    return [Table(heads, tuple(rows), (1, 2, 4, 5)), LIKELIHOOD]
 
 
 def _parameter(effect: str, name: str, found: Mapping[str, Any]) -> tuple[Any, ...]:
@@ -153,9 +154,9 @@ def _groups(document: Document) -> list[Items]:
     return [*_listed(groups, warn=True), *_listed(separate, title=title)]
 
 
-def _where(document: Document) -> list[Text | Table]:
+def _where(document: Document) -> list[str | Table]:
     found = _findings(document.get("where"))
-    return [*found, Text(AXES)] if found else []
+    return [*found, AXES] if found else []
 
 
 def _findings(found: Any, title: str = "") -> list[Table]:
@@ -170,7 +171,7 @@ def _findings(found: Any, title: str = "") -> list[Table]:
     return [Table(("signal", "axis", "regime", "when", "size"), tuple(rows), (4,), title)] if rows else []
 
 
-def _fit(document: Document) -> Iterable[Text | Table]:
+def _fit(document: Document) -> Iterable[str | Table]:
     fit = table(document.get("fit"))
     for part, words in (("held_out", "Flight kept apart"), ("train", "Flight it was fitted to")):
         both = table(fit.get(part))
@@ -183,7 +184,7 @@ def _fit(document: Document) -> Iterable[Text | Table]:
     closed = [(k, number(v)) for k, v in table(fit.get("gap_closed")).items()]
     shares = [f"{spaced(k)} {100 * v:.0f} %" for k, v in closed if v is not None]
     if shares and document.get("mismatch"):
-        yield Text(f"Of the mean square error at the longest horizon the fit took away: {', '.join(shares)}.")
+        yield f"Of the mean square error at the longest horizon the fit took away: {', '.join(shares)}."
 
 
 def _plain(both: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -212,15 +213,15 @@ def _horizons(before: Mapping[str, Any], after: Mapping[str, Any], spoilt: set[A
     return [Table(heads, tuple(rows), tuple(range(1, len(heads))), title)] if rows and ahead else []
 
 
-def _unknown(document: Document) -> Iterable[Text | Items | Table]:
+def _unknown(document: Document) -> Iterable[str | Items | Table]:
     left = table(document.get("unexplained"))
     if left.get("found") is False:
-        yield Text("Nothing is left over after the fit beyond the noise.")
+        yield "Nothing is left over after the fit beyond the noise."
     else:
         yield from _findings(left.get("where"), "Left over after the fit")
         share = number(left.get("explained_share"))
         if left.get("found") and share is not None and tables(document.get("effects")):
-            yield Text(f"The effects explain {100 * share:.0f} % of the structure that was found.")
+            yield f"The effects explain {100 * share:.0f} % of the structure that was found."
     reasons: dict[str, list[str]] = {}
     for entry in items(document.get("not_identifiable")):
         known = isinstance(entry, Mapping)
@@ -230,7 +231,7 @@ def _unknown(document: Document) -> Iterable[Text | Items | Table]:
     yield from _listed(texts, title="What this flight could not reveal")
 
 
-def _free(document: Document) -> list[Text | Table]:
+def _free(document: Document) -> list[str | Table]:
     rows = []
     for entry in tables(document.get("left_free")):
         unit = str(entry.get("unit", ""))
@@ -238,10 +239,10 @@ def _free(document: Document) -> list[Text | Table]:
         expected, usual = (quantity(entry.get(k), unit) for k in ("expected", "usual"))
         rows.append((str(entry.get("words", "")), str(entry.get("parameter", "")), value, expected, usual))
     heads = ("quantity", "of", "value", "expected", "usual sd")
-    return [Text(FREE), Table(heads, tuple(rows), (2, 3, 4))] if rows else []
+    return [FREE, Table(heads, tuple(rows), (2, 3, 4))] if rows else []
 
 
-def _ranking(document: Document) -> list[Text | Table]:
+def _ranking(document: Document) -> list[str | Table]:
     entries = tables(document.get("ranking"))
     best = max((number(e.get("held_out_nats")) or 0.0 for e in entries), default=0.0)
     named = {str(e.get("name")) for e in tables(document.get("effects"))}
@@ -251,12 +252,12 @@ def _ranking(document: Document) -> list[Text | Table]:
         share = 100 * max(held or 0.0, 0.0) / best if best > 0 else 0.0
         words = spaced(entry["words"]) if entry.get("words") else effect_words(entry.get("name", ""))
         note = str(entry.get("note", "")) or ("told" if str(entry.get("name")) in named else "")
-        rows.append((words, short(entry.get("gain_nats"), ".1f"), short(held, ".1f"), Meter(round(share, 1)), note))
+        rows.append((words, short(entry.get("gain_nats"), ".1f"), short(held, ".1f"), round(share, 1), note))
     heads = ("candidate", "gain", "held out", "", "")
-    return [Table(heads, tuple(rows), (1, 2)), Text(LIKELIHOOD)] if rows else []
+    return [Table(heads, tuple(rows), (1, 2)), LIKELIHOOD] if rows else []
 
 
-def _against(compared: Mapping[str, Any]) -> list[Text | Table]:
+def _against(compared: Mapping[str, Any]) -> list[str | Table]:
     """Differences from a simulated flight of the same mission, signal by signal."""
     rows = [
         (spaced(name), quantity(e.get("rms"), e.get("unit", "")), quantity(e.get("largest"), e.get("unit", "")))
@@ -264,7 +265,7 @@ def _against(compared: Mapping[str, Any]) -> list[Text | Table]:
         if isinstance(e, Mapping)
     ]
     said = f"{compared.get('simulated', '')}: {short(compared.get('seconds'))} s of the same mission"
-    return [Text(said), Table(("signal", "rms difference", "largest"), tuple(rows), (1, 2))] if rows else []
+    return [said, Table(("signal", "rms difference", "largest"), tuple(rows), (1, 2))] if rows else []
 
 
 def _listed(texts: Sequence[str], *, title: str = "", warn: bool = False) -> list[Items]:
@@ -274,3 +275,41 @@ def _listed(texts: Sequence[str], *, title: str = "", warn: bool = False) -> lis
 def _texts(value: Any) -> list[str]:
     """The texts of a list, or a single text as a list."""
     return [str(v) for v in items(value)] if isinstance(value, list | tuple) else [str(value)] if value else []
+
+
+MOST_ROWS = 12  # rows of a table
+
+
+def text_of(document: Document) -> str:
+    """The diagnosis for a terminal, without the sections for the page alone."""
+    lines = [verdict(document)]
+    for section in sections(document):
+        if section.page or not section.parts:
+            continue
+        lines += ["", section.title]
+        for part in section.parts:
+            if isinstance(part, Table):
+                lines += _columns(part)
+            elif isinstance(part, Items):
+                lines += [f"  {part.title}:"] * bool(part.title) + [f"  - {text}" for text in part.items]
+            else:
+                lines.append(f"  {part}")
+    return "\n".join(lines)
+
+
+def _columns(table: Table) -> Iterator[str]:
+    rows = [[_cell_text(cell) for cell in row] for row in table.rows[:MOST_ROWS]]
+    used = [k for k in range(len(table.heads)) if any(row[k] for row in rows)]
+    width = {k: max(len(row[k]) for row in [list(table.heads), *rows]) for k in used}
+    if table.title:
+        yield f"  {table.title}"
+    for row in [list(table.heads), *rows]:
+        cells = (row[k].rjust(width[k]) if k in table.right else row[k].ljust(width[k]) for k in used)
+        yield "    " + "  ".join(cells).rstrip()
+    if len(table.rows) > MOST_ROWS:
+        yield f"    and {len(table.rows) - MOST_ROWS} more"
+
+
+def _cell_text(cell: Any) -> str:
+    """A cell as text; "" for a picture."""
+    return "" if isinstance(cell, Bar | float) else cell.text if isinstance(cell, Cell) else str(cell)

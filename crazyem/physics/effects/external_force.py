@@ -3,7 +3,7 @@
 Gusts are a random process. They have parameters here and a likelihood elsewhere, and do not change the mean motion.
 force_by_place depends on the position of the drone: the force of a cable, a fan or a draught at a wall to first order,
 a constant and slopes for each world axis. It is no finding and never part of a vehicle file. It is a rival of named
-effects that may imitate it (`crazyem/diagnosis/naming/place_rivals.py`).
+effects that may imitate it (`crazyem/diagnosis/naming/alternatives.py`).
 """
 
 from collections.abc import Mapping
