@@ -52,7 +52,7 @@ OF_THE_PAPER = (
     "paper_cold_start.py::test_the_same_seed_flies_the_same_flight",
 )  # fmt: skip
 OF_EFFECTS = (
-    "physics_effects_pendulum.py", "physics_sampled_commands.py",
+    "physics_effects_pendulum.py", "physics_lag.py",
     "physics_effects_bodies.py::test_swing_of_a_small_angle_has_the_textbook_period_and_dies_in_twenty_seconds",
     "physics_effects_bodies.py::test_swing_knows_no_later_row_and_starts_anew_after_a_gap",
     "diagnosis_onboard_filter.py::test_what_a_force_changes_in_the_velocity_that_is_shown_is_a_difference_of_likelihoods",
