@@ -130,8 +130,6 @@ class RowMaker:
                 sensed[:, c, 3:6] = tape.xp[first:last, 3:6]
             elif kind == h.RATE_SCALE:
                 sensed[:, c, 9:12] = tape.xp[first:last, 10:13]
-            elif kind == h.LATENESS:
-                sensed[:, c] = lateness(tape, first, last)
         return acting, sensed
 
     def nuisances(

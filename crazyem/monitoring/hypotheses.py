@@ -10,12 +10,11 @@ from crazyem.physics.effects import sensing
 from crazyem.physics.effects.external_force import WIND
 from crazyem.physics.effects.mass_properties import PAYLOAD
 from crazyem.physics.effects.rotors import ROTOR_FAULT, THRUST_SCALE, TRIM
-from crazyem.physics.effects.timing import MEASUREMENT_DELAY
 from crazyem.vehicle import Vehicle
 
 # Kinds of column; the second number of a column is its axis or rotor.
 ROTOR, MASS, CENTRE, THRUST, FORCE, TORQUE, KICK, TURN = range(8)  # acts on the body
-POSITION, VELOCITY, ATTITUDE, RATE, VELOCITY_SCALE, RATE_SCALE, LATENESS = range(8, 15)  # acts on a sensor
+POSITION, VELOCITY, ATTITUDE, RATE, VELOCITY_SCALE, RATE_SCALE = range(8, 14)  # acts on a sensor
 ONCE = (KICK, TURN)
 
 
@@ -65,7 +64,7 @@ def hypotheses_for(vehicle: Vehicle) -> tuple[Hypothesis, ...]:
     """Hypotheses for a vehicle; faults of single rotors only if its file contains the rotor geometry.
 
     The priors of sizes are those of changes that matter to a pilot: a third of a rotor's thrust, a fifth of the mass,
-    a wind that tilts the drone by some degrees, sensor errors of ten times their noise, a lateness of two samples.
+    a wind that tilts the drone by some degrees, sensor errors of ten times their noise.
     """
     weight = vehicle.mass * 9.81
     arm = max(vehicle.arm) or 0.05
@@ -101,9 +100,6 @@ def hypotheses_for(vehicle: Vehicle) -> tuple[Hypothesis, ...]:
             Column(VELOCITY_SCALE, 0, "scale_error", "", 0.5),
         )),
         Hypothesis("gyro_scale", "body rates have another scale", (Column(RATE_SCALE, 0, "scale_error", "", 0.5),)),
-        Hypothesis(MEASUREMENT_DELAY.name, "the measurements became late", (
-            Column(LATENESS, 0, "delay", "s", 0.02),  # a sample or two, which a link or an onboard computer left out
-        )),
     )  # fmt: skip
     geometry = vehicle.arm[0] > 0 and vehicle.arm[1] > 0 and vehicle.torque_per_thrust > 0
     return (*(rotors if geometry else ()), *body, *sensors)

@@ -112,23 +112,6 @@ def test_a_sensor_that_is_biased_is_named(flight: list[Sample]) -> None:
 
 
 @pytest.mark.slow
-def test_measurements_that_become_late_by_a_sample_are_named(flight: list[Sample]) -> None:
-    """A link that repeats one sample of each measured signal: from then on, all of them are late."""
-    before: dict[str, tuple[float, ...]] = {}
-    late = []
-    for sample in flight:
-        held = before.get(sample.signal, sample.value)
-        hit = sample.signal != "wrench_command" and sample.time >= ONSET
-        late.append(replace(sample, value=held) if hit else sample)
-        before[sample.signal] = sample.value
-    period = np.median(np.diff([s.time for s in flight if s.signal == "position"]))
-    reports, _ = monitored(late)
-    assert reports[0].effect == "measurement_delay"
-    assert reports[0].detected - ONSET < 0.3
-    assert reports[0].sizes["delay"].value == pytest.approx(period, abs=0.3 * period)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("judgements", "reported"), [(1, False), (2, True)])
 def test_a_change_is_reported_by_two_judgements_in_a_row(
     flight: list[Sample], monkeypatch: pytest.MonkeyPatch, judgements: int, reported: bool
