@@ -68,7 +68,7 @@ def unlogged_share(flights: Sequence[Flight], vehicle: Vehicle) -> float:
 
     Commands contain the noise of the gyro, so their innovations correlate with its samples and with the rates between
     samples. A model with free responses to six innovations gives inertias in eight flights with shares of 0.2 to 0.7
-    (benchmarks/concealed, random, seeds 21601 and 22601) standard deviations of 0.25 to 0.8. So such a log does not
+    (benchmarks/concealed, random, seeds 21601 and 22601) standard deviations of 0.2 to 0.9. So such a log does not
     know the torques any better.
     """
     shares = [0.0]
