@@ -126,8 +126,9 @@ class FlightMonitor:
         return self._detector.tested
 
     def _filtered(self, em: WindowEM, p: Parameters, first: int, last: int, sd: NDArray[np.float64] | None) -> None:
-        # innovations about a model that does not describe the rotation say nothing of faults
-        unexplained = bool(implausible_inertia(p.theta, em.setup).any())
+        # Innovations about a model that does not describe the rotation say nothing of faults. After a fault, estimates
+        # are implausible because of this fault.
+        unexplained = not self.faults and bool(implausible_inertia(p.theta, em.setup).any())
         self.suspended = ROTATION_UNEXPLAINED if unexplained else ""
         if unexplained:
             self._detector.pause(float(em.tape.time[last - 1]))

@@ -101,6 +101,12 @@ def test_nothing_is_reported_while_the_commands_do_not_explain_the_rotation(flig
     assert reports == []
     assert monitor.suspended == ROTATION_UNEXPLAINED
     assert monitor.tested == 0.0
+    after_a_fault, estimator = FlightMonitor(VEHICLE, FaultRules()), OnlineEstimator(VEHICLE, window=400)
+    after_a_fault.faults = (Fault("impact", None, "the drone was hit", 0.0, 0.1, {}, 1.0, {}, True),)
+    after_a_fault.watch(estimator)
+    for sample in unlike:
+        estimator.feed(sample)
+    assert after_a_fault.suspended == ""  # the fault explains the estimates
 
 
 @pytest.mark.slow
