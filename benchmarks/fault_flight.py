@@ -25,9 +25,9 @@ from crazyem.estimation.steps import StepAwareEstimator
 from crazyem.links import open_link
 from crazyem.live.controllers import LEE, writes_for
 from crazyem.live.flight import Flight, FlightPlan
+from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.guard import INERTIA_NAMES, Decision
 from crazyem.live.history import open_recorder
-from crazyem.live.pipeline import monitor_for
 from crazyem.live.policy import FaultRules, WriteRules
 from crazyem.live.runner import warm_up
 from crazyem.live.session import Session

@@ -23,7 +23,8 @@ from crazyem.live.pipeline import Estimator, Pipeline
 from crazyem.live.policy import WriteRules, load_policy
 from crazyem.live.push import nominal_estimates
 from crazyem.live.session import block_plan
-from crazyem.live.telemetry import Telemetry, WriteGate
+from crazyem.live.telemetry import Telemetry
+from crazyem.live.write_gate import WriteGate
 from crazyem.live.write_supervisor import WriteSupervisor
 from crazyem.signals.sample import Block, Packet, Variable
 from crazyem.signals.vocabulary import compress_quaternion, decoders

@@ -23,7 +23,7 @@ from scipy.stats import chi2
 
 from benchmarks.monitor_flight import FAULTS, draw, samples
 from crazyem.estimation.steps import estimator_for
-from crazyem.live.pipeline import FlightMonitor
+from crazyem.live.flight_monitor import FlightMonitor
 from crazyem.live.policy import FaultRules
 from crazyem.monitoring.fault import Fault
 from crazyem.physics import folding

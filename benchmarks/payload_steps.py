@@ -30,7 +30,8 @@ from crazyem.live.guard import Decision, Guard
 from crazyem.live.history import History, Push
 from crazyem.live.pipeline import Pipeline
 from crazyem.live.policy import WriteRules, load_policy
-from crazyem.live.telemetry import CAN_FLY, FLYING, Telemetry, WriteGate
+from crazyem.live.telemetry import CAN_FLY, FLYING, Telemetry
+from crazyem.live.write_gate import WriteGate
 from crazyem.live.write_supervisor import WriteSupervisor
 from crazyem.signals.sample import Block, Packet, Sample, Variable
 from crazyem.signals.vocabulary import STATE_VARIABLES, decoders

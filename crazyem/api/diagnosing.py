@@ -14,7 +14,7 @@ from crazyem.diagnosis.document import compare, document_of, saved_vehicle, text
 from crazyem.diagnosis.naming.steady import with_baseline
 from crazyem.diagnosis.prediction import predict as prediction
 from crazyem.diagnosis.prediction.predict import Prediction, recorded
-from crazyem.diagnosis.report.html import Series, draw
+from crazyem.diagnosis.report.pictures import Series, draw
 from crazyem.errors import UsageError
 from crazyem.notebook import finite, html_table, new_figure, saved
 from crazyem.recordings.contents import ReadOptions

@@ -13,9 +13,9 @@ from crazyem.errors import CrazyemError, UsageError
 from crazyem.estimation.steps import estimator_for
 from crazyem.live.controllers import controller_named
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
+from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.flight_result import FlightResult
 from crazyem.live.history import Recorder
-from crazyem.live.pipeline import monitor_for
 from crazyem.live.policy import Policy, WriteRules, load_policy
 from crazyem.live.runner import connect, finished, open_session, warm_up
 from crazyem.live.session import LOG_RATE, RECONNECT_WITHIN, Session

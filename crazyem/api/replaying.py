@@ -6,9 +6,10 @@ from crazyem.api.inputs import RecordingLike, VehicleLike, recording_of, vehicle
 from crazyem.doctor import examine
 from crazyem.errors import DataError
 from crazyem.estimation.steps import StepAwareEstimator, estimator_for
+from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.flight_result import FlightResult, result_of
 from crazyem.live.history import History, Push
-from crazyem.live.pipeline import Pipeline, monitor_for
+from crazyem.live.pipeline import Pipeline
 from crazyem.live.policy import FaultRules
 from crazyem.physics import folding
 from crazyem.recordings.airborne import Airtime, airtime

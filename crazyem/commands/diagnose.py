@@ -8,7 +8,7 @@ from pathlib import Path
 from crazyem.atomic_file import write_file
 from crazyem.commands.files import read_options
 from crazyem.commands.output import deliver, names_in
-from crazyem.live.flight_result import check_writable
+from crazyem.live.summary import check_writable
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -19,9 +19,9 @@ from crazyem.commands.output import LiveLine, plot_path, report, say
 from crazyem.control.named_trajectories import duration_note, trajectory_maker
 from crazyem.errors import CrazyemError
 from crazyem.live.flight import FlightInterruptedError, Interrupts, MotorsCutError
-from crazyem.live.flight_result import check_writable
 from crazyem.live.history import Recorder
 from crazyem.live.session import Session
+from crazyem.live.summary import check_writable
 from crazyem.physics import folding
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from crazyem.commands.output import put
 from crazyem.errors import UsageError
 from crazyem.links.scan import UDP_PORTS, Interface, scan
-from crazyem.live.flight_result import check_writable, write_json
+from crazyem.live.summary import check_writable, write_json
 
 _INTERFACE_TITLES = {
     "radio": "Radio (Crazyradio)",

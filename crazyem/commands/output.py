@@ -12,8 +12,9 @@ from typing import Any
 from crazyem.atomic_file import write_file
 from crazyem.errors import UsageError
 from crazyem.extras import MissingExtraError, require
-from crazyem.live.flight_result import FlightResult, check_writable, live_line, write_json
+from crazyem.live.flight_result import FlightResult
 from crazyem.live.history import History
+from crazyem.live.summary import check_writable, live_line, write_json
 from crazyem.monitoring.fault import Fault
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.vehicle import Vehicle

@@ -5,7 +5,7 @@ import argparse
 from crazyem.atomic_file import write_file
 from crazyem.commands.output import names_in, put, say
 from crazyem.errors import CrazyemError, UsageError
-from crazyem.live.flight_result import check_writable, write_json
+from crazyem.live.summary import check_writable, write_json
 
 
 class NoManoeuvreError(CrazyemError):

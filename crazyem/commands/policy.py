@@ -3,8 +3,8 @@
 import argparse
 
 from crazyem.commands.output import put
-from crazyem.live.flight_result import check_writable, write_json
 from crazyem.live.policy import default_text, load_policy
+from crazyem.live.summary import check_writable, write_json
 
 
 def run(arguments: argparse.Namespace) -> int:

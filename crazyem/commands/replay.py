@@ -6,8 +6,8 @@ import time
 from crazyem.api.replaying import replay
 from crazyem.commands.files import read_options
 from crazyem.commands.output import News, plot_path, report, say
-from crazyem.live.flight_result import check_writable, live_line
 from crazyem.live.history import History
+from crazyem.live.summary import check_writable, live_line
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -32,10 +32,11 @@ from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links.base import Link
 from crazyem.live.controllers import controller_named
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
-from crazyem.live.flight_result import FlightResult, check_writable, interval_text, write_json
+from crazyem.live.flight_result import FlightResult
 from crazyem.live.runner import connect, finished, open_session
 from crazyem.live.scheduler import Scheduler, UpdateThrottle
 from crazyem.live.session import Session
+from crazyem.live.summary import check_writable, interval_text, write_json
 from crazyem.live.swarm import (
     Course,
     Member,

@@ -7,7 +7,7 @@ from crazyem.atomic_file import write_file
 from crazyem.commands.files import read_options
 from crazyem.commands.output import deliver, names_in, say
 from crazyem.errors import DataError, UsageError
-from crazyem.live.flight_result import check_writable
+from crazyem.live.summary import check_writable
 
 BY_SUFFIX = {".urdf": "gym-pybullet-drones", ".sdf": "gazebo", ".py": "rotorpy"}
 

@@ -22,12 +22,12 @@ from crazyem.commands.output import LiveLine, compile_kernels, new_estimator, pl
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
 from crazyem.links.base import Link
-from crazyem.live.flight_result import check_writable
-from crazyem.live.pipeline import monitor_for
+from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.policy import Policy, WriteRules, load_policy
 from crazyem.live.push import hover_afterwards
 from crazyem.live.runner import connect, finished, open_session
 from crazyem.live.session import Session
+from crazyem.live.summary import check_writable
 from crazyem.live.telemetry import FLYING
 from crazyem.physics import folding
 from crazyem.vehicle import Vehicle

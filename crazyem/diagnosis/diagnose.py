@@ -13,37 +13,25 @@ from crazyem.diagnosis.fitting.nuisances import (
     is_nonphysical,
     with_thrust_scales,
     with_trim_noise,
-    with_zero_trim,
     without_unobservable,
 )
+from crazyem.diagnosis.fitting.sampling import with_zero_trim
 from crazyem.diagnosis.flights import recording_nuisances as held_out_roles
 from crazyem.diagnosis.flights.flight import Flight, flight_of
-from crazyem.diagnosis.flights.recording_nuisances import (
-    RecordingNuisances,
-    in_mean_frame,
-    nuisances_of_recordings,
-    with_common_floor,
-)
+from crazyem.diagnosis.flights.frame import in_mean_frame
+from crazyem.diagnosis.flights.recording_nuisances import RecordingNuisances, nuisances_of_recordings, with_common_floor
+from crazyem.diagnosis.locating.heading import heading_by_place
 from crazyem.diagnosis.locating.locate import Located, locate
-from crazyem.diagnosis.locating.place import depends_on_place, heading_by_place, pushes_away
-from crazyem.diagnosis.naming.alternatives import (
-    LOAD,
-    WEAKER,
-    by_place,
-    load_against_rotors,
-    rotors_against_load,
-    with_better_rivals,
-    with_replacement,
-)
+from crazyem.diagnosis.locating.place import depends_on_place, pushes_away
+from crazyem.diagnosis.naming.alternatives import with_better_rivals, with_replacement
 from crazyem.diagnosis.naming.answer import Answer, Free, Named, answer_of, left_free, strongest_first
 from crazyem.diagnosis.naming.balance import by_balance, hidden_by_daily_variation, steady_selection
-from crazyem.diagnosis.naming.other_likelihoods import false_speed, late_measurements, late_rotors, other_likelihoods
-from crazyem.diagnosis.naming.prune import (
-    determined,
-    with_accepted_effects,
-    without_undetermined,
-    without_worse_predictions,
-)
+from crazyem.diagnosis.naming.corroboration import false_speed, late_measurements
+from crazyem.diagnosis.naming.determined import determined, without_undetermined
+from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, load_against_rotors, rotors_against_load
+from crazyem.diagnosis.naming.other_likelihoods import late_rotors, other_likelihoods
+from crazyem.diagnosis.naming.place_rivals import by_place
+from crazyem.diagnosis.naming.prediction_check import with_accepted_effects, without_worse_predictions
 from crazyem.diagnosis.naming.rotor_response import answers, unresponsive_rotor
 from crazyem.diagnosis.naming.select import select
 from crazyem.diagnosis.naming.steady import with_exact_torques, with_its_thrust, with_remaining_trim

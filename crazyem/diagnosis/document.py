@@ -34,7 +34,7 @@ from crazyem.diagnosis.prediction.horizon import (
 )
 from crazyem.diagnosis.prediction.predict import recorded
 from crazyem.diagnosis.report.content import text_of
-from crazyem.diagnosis.report.html import Series
+from crazyem.diagnosis.report.pictures import Series
 from crazyem.diagnosis.report.verdict import joined, prefixed
 from crazyem.errors import DataError
 from crazyem.physics.effects.catalogue import CATALOGUE

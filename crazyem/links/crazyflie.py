@@ -16,7 +16,8 @@ from crazyem.links.base import AnotherDroneError, LinkLost, LinkStatistics, Outa
 from crazyem.links.blocks import LogBlocks
 from crazyem.links.clock import ClockFit
 from crazyem.links.connection import Reconnector, add_callbacks, connect, quiet_cflib, shut
-from crazyem.links.requests import ParameterClient, land_command, send_until_confirmed
+from crazyem.links.parameters import ParameterClient
+from crazyem.links.requests import land_command, send_until_confirmed
 from crazyem.signals.sample import Block, Packet
 
 SILENT_AFTER = 2.0  # s without log data from running blocks, after which the drone counts as lost

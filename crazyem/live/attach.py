@@ -7,7 +7,7 @@ from typing import Protocol
 
 from crazyem.errors import DataError
 from crazyem.estimation.result import Estimate
-from crazyem.live.pipeline import monitor_for
+from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.policy import Policy, WriteRules, load_policy
 from crazyem.live.session import Session
 from crazyem.monitoring.fault import Fault

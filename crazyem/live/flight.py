@@ -10,10 +10,10 @@ from crazyem.control.indi import PARAMETERS, IndiGains
 from crazyem.control.trajectories import Trajectory, Vector, after_hover
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links.base import ConfirmingLink, HostClockLink, Link
-from crazyem.live.clock import SetpointStream
 from crazyem.live.controllers import Controller
 from crazyem.live.policy import WriteRules
 from crazyem.live.session import Session
+from crazyem.live.stream import SetpointStream
 from crazyem.live.telemetry import ARMED, CAN_FLY, FLYING
 
 BASELINE_SECONDS = 3.0  # s of hover before the first push: shows the behaviour with the present parameters

@@ -21,7 +21,7 @@ from crazyem.live.controllers import CONTROLLERS, Controller, for_vehicle, with_
 from crazyem.live.guard import Decision, Guard
 from crazyem.live.history import History, Push
 from crazyem.live.policy import WriteRules
-from crazyem.live.telemetry import WriteGate
+from crazyem.live.write_gate import WriteGate
 from crazyem.vehicle import Vehicle
 
 ONBOARD_DRAG = ("kalman.dragB_x", "kalman.dragB_y")

@@ -15,9 +15,10 @@ from crazyem.estimation.in_step import PERIOD
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.links import open_link
 from crazyem.links.base import Link
+from crazyem.live.flight_monitor import FlightMonitor
 from crazyem.live.flight_result import FlightResult, result_of
 from crazyem.live.history import Recorder, open_recorder
-from crazyem.live.pipeline import Estimator, FlightMonitor
+from crazyem.live.pipeline import Estimator
 from crazyem.live.policy import FaultRules
 from crazyem.live.scheduler import Scheduler
 from crazyem.live.session import Session

@@ -27,13 +27,15 @@ from crazyem.links.base import (
     link_account,
 )
 from crazyem.live.clock import FirmwareClock
+from crazyem.live.flight_monitor import FlightMonitor, event_lines
 from crazyem.live.guard import Guard
 from crazyem.live.history import FrameRecorder, History, Recorder
-from crazyem.live.pipeline import Estimator, FlightMonitor, Pipeline, event_lines
+from crazyem.live.pipeline import Estimator, Pipeline
 from crazyem.live.policy import WriteRules, load_policy
 from crazyem.live.push import Pusher, hover_rules, hover_target, nominal_estimates, push_target, read_originals
 from crazyem.live.scheduler import Mailbox, Scheduler
-from crazyem.live.telemetry import Telemetry, WriteGate
+from crazyem.live.telemetry import Telemetry
+from crazyem.live.write_gate import WriteGate
 from crazyem.live.write_supervisor import WriteSupervisor
 from crazyem.monitoring.fault import Fault
 from crazyem.signals.sample import Block, Packet, Sample

@@ -21,7 +21,7 @@ from crazyem.live.history import History
 from crazyem.live.policy import WriteRules
 from crazyem.live.post_write_monitor import PostWriteMonitor
 from crazyem.live.push import Pusher
-from crazyem.live.telemetry import WriteGate
+from crazyem.live.write_gate import WriteGate
 from crazyem.signals.sample import Sample
 
 # s, 4 Hz, second order: with too high a loop gain INDI oscillates with 7 to 12 Hz; an excitation has 1 to 4 Hz.

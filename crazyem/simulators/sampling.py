@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.fitting.nuisances import day_sd
+from crazyem.diagnosis.fitting.days import day_sd
 from crazyem.errors import DataError, UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.rotors import THRUST_SCALE, TRIM

@@ -10,8 +10,8 @@ from crazyem.control.trajectories import hover
 from crazyem.errors import CrazyemError
 from crazyem.live.controllers import LEE
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
-from crazyem.live.flight_result import build_summary, text_summary
 from crazyem.live.session import Session
+from crazyem.live.summary import build_summary, text_summary
 from crazyem.vehicle import load_vehicle
 
 

@@ -16,12 +16,12 @@ from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import DivergedError
 from crazyem.diagnosis.fitting.nuisances import COARSE_REASON, refine_base
 from crazyem.diagnosis.locating.locate import Finding
-from crazyem.diagnosis.naming import answer, trials
-from crazyem.diagnosis.naming import starting_points as onset
+from crazyem.diagnosis.locating.random_torques import AT_RANDOM
+from crazyem.diagnosis.naming import answer, starting_points, trials
 from crazyem.diagnosis.naming.answer import confidence_factor
 from crazyem.diagnosis.naming.select import select
 from crazyem.diagnosis.naming.trials import Selection
-from crazyem.diagnosis.naming.unexplained import AT_RANDOM, Unexplained, notable
+from crazyem.diagnosis.naming.unexplained import Unexplained, notable
 from crazyem.diagnosis.settings import CONFIDENCE
 from crazyem.physics.effects import mass_properties
 
@@ -54,7 +54,7 @@ def test_an_inertia_that_no_body_has_leaves_open_what_turns_the_drone(slow_to_tu
 def test_an_effect_without_a_sound_fit_is_left_out_and_the_selection_goes_on(monkeypatch, diverges):
     """In the fit with all nuisances, a thrust scale is at the end of its range, or the filter leaves the numbers."""
     data, point = nominal_of(fly(Hidden(drag=(0.02, 0.02, 0.02), thrust=(0.9,) * 4), seconds=10.0))
-    real, said = onset.refine_with_memory, []
+    real, said = starting_points.refine_with_memory, []
 
     def unsound(data, point, accepted, **more):
         fit = real(data, point, accepted, **more)
@@ -64,7 +64,7 @@ def test_an_effect_without_a_sound_fit_is_left_out_and_the_selection_goes_on(mon
             raise DivergedError("the filter leaves the range of numbers")
         return replace(fit, point=fit.point.with_effects({"thrust_scale": {"scale": THRUST.range_of("scale")[0]}}))
 
-    monkeypatch.setattr(onset, "refine_with_memory", unsound)
+    monkeypatch.setattr(starting_points, "refine_with_memory", unsound)
     found = select(data, point, [THRUST, DRAG], say=said.append)
     reason = "the model leaves the range of numbers" if diverges else "at the end of its physical range"
     assert sum(f"{reason}: thrust_scale" in text for text in said) == 1

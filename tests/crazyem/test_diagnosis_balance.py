@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.days import day_freedom, day_sd
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, local_precision, log_prior
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import start_noise
-from crazyem.diagnosis.fitting.nuisances import day_freedom, day_sd
 from crazyem.diagnosis.naming import balance as balancing
 from crazyem.diagnosis.naming.answer import _by_the_day, _steady_rivals
 from crazyem.diagnosis.naming.balance import (

@@ -20,7 +20,7 @@ from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.place import depends_on_place
 from crazyem.diagnosis.naming.answer import answer_of
-from crazyem.diagnosis.naming.other_likelihoods import _lag_of, false_speed, late_measurements
+from crazyem.diagnosis.naming.corroboration import _lag_of, false_speed, late_measurements
 from crazyem.diagnosis.naming.trials import (
     Selection,
     Step,

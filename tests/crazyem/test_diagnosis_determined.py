@@ -16,9 +16,9 @@ from crazyem.diagnosis.document import document_of
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.nuisances import refine_base
-from crazyem.diagnosis.naming import prune as deciding
+from crazyem.diagnosis.naming import prune
 from crazyem.diagnosis.naming.answer import Named, Value
-from crazyem.diagnosis.naming.prune import determined, without_undetermined
+from crazyem.diagnosis.naming.determined import determined, without_undetermined
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings.recording import Recording
@@ -164,7 +164,7 @@ def test_what_is_not_determined_is_left_out_and_the_rest_fitted_again(dragged: D
 
 def test_a_number_at_its_end_is_held_at_none_and_the_others_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """A load 40 mm above the rotors; its weight and where it draws the drone are determined."""
-    monkeypatch.setattr(deciding, "improbable", lambda chance: "")  # however sure it is
+    monkeypatch.setattr(prune, "improbable", lambda chance: "")  # however sure it is
     load = LOAD
     flown = data_of(fly(Hidden(thrust=(0.9,) * 4), seconds=6.0))
     selection = selected(flown, load, payload={"mass": 0.004, "x": 0.0, "y": 0.0, "z": 0.04})

@@ -11,12 +11,8 @@ from scipy.spatial.transform import Rotation
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.document import document_of
 from crazyem.diagnosis.flights.flight import Flight, flight_of
-from crazyem.diagnosis.flights.recording_nuisances import (
-    in_mean_frame,
-    nuisances_of_recordings,
-    tilt_of,
-    with_common_floor,
-)
+from crazyem.diagnosis.flights.frame import in_mean_frame, tilt_of
+from crazyem.diagnosis.flights.recording_nuisances import nuisances_of_recordings, with_common_floor
 from crazyem.recordings.recording import Recording
 
 DRAG = Hidden(drag=(0.02, 0.015, 0.0))

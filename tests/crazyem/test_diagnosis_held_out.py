@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.cli import main
-from crazyem.diagnosis.flights import recording_nuisances as held_out_roles
+from crazyem.diagnosis.flights import recording_nuisances
 from crazyem.diagnosis.flights.flight import Flight, flight_of
 from crazyem.recordings.mcap.signals import write_recording
 
@@ -51,7 +51,10 @@ def moving(flight: Flight, speed: float, rate: float = 0.1) -> Flight:
 def test_those_that_only_hover_confirm(
     flight: Flight, fitted: list[tuple[float, float]], apart: list[tuple[float, float]], expected: bool
 ) -> None:
-    assert held_out_roles.swapped([moving(flight, *f) for f in fitted], [moving(flight, *f) for f in apart]) is expected
+    assert (
+        recording_nuisances.swapped([moving(flight, *f) for f in fitted], [moving(flight, *f) for f in apart])
+        is expected
+    )
 
 
 def test_what_was_not_measured_decides_nothing(flight: Flight) -> None:
@@ -59,16 +62,16 @@ def test_what_was_not_measured_decides_nothing(flight: Flight) -> None:
     for blind in (slice(3, 6), slice(10, 13)):
         y = hover.y.copy()
         y[:, blind] = np.nan
-        assert not held_out_roles.swapped([replace(hover, y=y)], [quick])
+        assert not recording_nuisances.swapped([replace(hover, y=y)], [quick])
     y = hover.y.copy()
     y[::3, 3:6] = np.nan
-    assert held_out_roles.swapped([replace(hover, y=y)], [quick])  # gaps do not hide that it hovers
+    assert recording_nuisances.swapped([replace(hover, y=y)], [quick])  # gaps do not hide that it hovers
 
 
 @given(st.lists(st.floats(0.001, 3.0), min_size=1, max_size=3), st.lists(st.floats(0.001, 3.0), min_size=1, max_size=3))
 def test_never_both_ways(here: list[float], there: list[float]) -> None:
     one, other = [moving(made(), s) for s in here], [moving(made(), s) for s in there]
-    assert not (held_out_roles.swapped(one, other) and held_out_roles.swapped(other, one))
+    assert not (recording_nuisances.swapped(one, other) and recording_nuisances.swapped(other, one))
 
 
 @pytest.mark.slow
@@ -78,7 +81,7 @@ def test_all_that_is_told_follows(
     for name, seconds in (("hover", 8.0), ("quick", 12.0)):
         write_recording(fly(Hidden(drag=(0.02, 0.015, 0.01)), seconds=seconds), tmp_path / f"{name}.mcap")
     (tmp_path / "made.toml").write_text(DRONE.to_toml())
-    monkeypatch.setattr(held_out_roles, "swapped", lambda fitted, apart: len(apart) > 0)
+    monkeypatch.setattr(recording_nuisances, "swapped", lambda fitted, apart: len(apart) > 0)
     out = tmp_path / "d.json"
     hover, quick = (str(tmp_path / f"{n}.mcap") for n in ("hover", "quick"))
     words = ["diagnose", hover, "--held-out", quick, "--vehicle", str(tmp_path / "made.toml")]

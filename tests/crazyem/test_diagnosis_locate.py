@@ -8,8 +8,8 @@ from made_flight import changed, without
 from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.fitting.fit import nominal
+from crazyem.diagnosis.locating.heading import heading_by_place
 from crazyem.diagnosis.locating.locate import Located, locate
-from crazyem.diagnosis.locating.place import heading_by_place
 from crazyem.recordings.recording import Recording
 
 

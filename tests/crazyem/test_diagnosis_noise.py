@@ -10,17 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import (
-    Noise,
-    coloured,
-    fit_noise,
-    logs_of,
-    noise_of,
-    run_sweep,
-    sample_rows,
-    scored_sweep,
-    without_negligible,
-)
+from crazyem.diagnosis.fitting.noise import coloured, fit_noise, logs_of, noise_of, sample_rows, without_negligible
+from crazyem.diagnosis.fitting.sweeps import Noise, run_sweep, scored_sweep
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.settings import NOISE
 from crazyem.physics.motion import RotorInput

@@ -20,9 +20,9 @@ from crazyem.diagnosis.fitting.nuisances import (
     refine_base,
     refine_with_memory,
     systematic_sd,
-    unlogged_share,
     without_unobservable,
 )
+from crazyem.diagnosis.fitting.sampling import unlogged_share
 from crazyem.diagnosis.flights.flight import _blocks, thinned
 from crazyem.diagnosis.settings import RECORDINGS
 from crazyem.physics.effects.catalogue import CATALOGUE

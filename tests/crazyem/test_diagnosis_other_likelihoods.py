@@ -18,8 +18,9 @@ from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.flights.flight import without
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.locating.place import pushes_away
-from crazyem.diagnosis.naming import other_likelihoods as beside
-from crazyem.diagnosis.naming.other_likelihoods import Gusts, find_gusts, lateral_force, other_likelihoods
+from crazyem.diagnosis.naming import accelerometer
+from crazyem.diagnosis.naming.gusts import Gusts, find_gusts, lateral_force
+from crazyem.diagnosis.naming.other_likelihoods import other_likelihoods
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.diagnosis.settings import ACCELEROMETER, CONFIDENCE
 from crazyem.errors import DataError
@@ -62,12 +63,12 @@ def test_a_tilted_accelerometer_is_measured_and_an_upright_one_is_not_accused(re
     turned = tilted(recording, 0.03, -0.02)
     for flown, true in ((turned, (0.03, -0.02)), (recording, (0.0, 0.0))):
         data, point = fitted(flown)
-        solution = beside.tilt(data, point)
+        solution = accelerometer.tilt(data, point)
         sd = np.sqrt(np.diag(solution.covariance)[:2])
         assert np.all(np.abs(solution.theta[:2] - true) < 4 * sd)
         assert np.all((sd > ACCELEROMETER.angle_sd) & (sd < 2e-3))
-        named = judged(data, point, beside.MISALIGNED)
-        assert [f.name for f in named] == [beside.MISALIGNED] * (flown is turned)
+        named = judged(data, point, accelerometer.MISALIGNED)
+        assert [f.name for f in named] == [accelerometer.MISALIGNED] * (flown is turned)
         # thrust along z does not show the yaw: a board's few degrees, not what the residuals' scatter makes of it
         yaw, unsure = solution.theta[2], np.sqrt(solution.covariance[2, 2])
         assert abs(yaw) < 2 * unsure
@@ -78,14 +79,17 @@ def test_a_tilted_accelerometer_is_measured_and_an_upright_one_is_not_accused(re
 def test_a_yaw_that_nothing_shows_is_no_tilt(recording, monkeypatch, roll, held, told):
     """Nor is a roll that held-out flights do not confirm."""
     data, point = fitted(recording)
-    solution = beside.tilt(data, point)
+    solution = accelerometer.tilt(data, point)
     theta, sds = np.array([roll, 0.0, 0.08, *np.zeros(4)]), np.array([1e-4, 1e-4, 0.1, *np.ones(4)])
-    monkeypatch.setattr(beside, "tilt", lambda *_: replace(solution, theta=theta, covariance=np.diag(sds**2)))
-    monkeypatch.setattr(beside, "held_out_gain", lambda *given, **more: held)
-    found = judged(data, point, beside.MISALIGNED)
-    assert [f.name for f in found] == [beside.MISALIGNED] * told
+    monkeypatch.setattr(
+        "crazyem.diagnosis.naming.other_likelihoods.tilt",
+        lambda *_: replace(solution, theta=theta, covariance=np.diag(sds**2)),
+    )
+    monkeypatch.setattr("crazyem.diagnosis.naming.other_likelihoods.held_out_gain", lambda *given, **more: held)
+    found = judged(data, point, accelerometer.MISALIGNED)
+    assert [f.name for f in found] == [accelerometer.MISALIGNED] * told
     left = Finding("force", "z", "z position", "z", (0.0, 9.0), 5e-3, 5e-4, "N", 250.0, 1e-9)
-    doubtful = judged(data, point, beside.MISALIGNED, Unexplained((left,), 0.0))
+    doubtful = judged(data, point, accelerometer.MISALIGNED, Unexplained((left,), 0.0))
     for one, other in zip(found, doubtful, strict=True):
         assert other.confidence == pytest.approx(CONFIDENCE.doubtful * one.confidence)
         assert other.log_odds == one.log_odds
@@ -96,7 +100,9 @@ def test_a_yaw_that_was_not_seen_does_not_cost_what_the_tilt_brings(recording):
     is known to be unsure."""
     data, point = fitted(tilted(recording, 0.03, -0.02))
     point = point.with_effects({"linear_drag": {"x": 0.03, "y": 0.03, "z": 0.03}})
-    sure, unsure = (beside.held_out_gain(data, point, np.array([0.03, -0.02, 0.3]), yaw_sd=sd) for sd in (1e-4, 0.3))
+    sure, unsure = (
+        accelerometer.held_out_gain(data, point, np.array([0.03, -0.02, 0.3]), yaw_sd=sd) for sd in (1e-4, 0.3)
+    )
     assert unsure > sure + 1.0
 
 
@@ -107,12 +113,12 @@ def test_what_a_prior_says_is_no_weaker_because_residuals_scatter(recording):
     assert instead > 60
     for model in data.models:  # from second to second, on the whole nothing
         model.flight.force[:] += 0.2 * (-1.0) ** np.floor(model.flight.time)[:, None]
-    assert beside.gram_dispersion(data, point) > 3
-    assert beside.held_out_gain(data, point, np.array([0.03, -0.02, 0.0]), yaw_sd=0.3) > 0.5 * instead
+    assert accelerometer.gram_dispersion(data, point) > 3
+    assert accelerometer.held_out_gain(data, point, np.array([0.03, -0.02, 0.0]), yaw_sd=0.3) > 0.5 * instead
 
 
 def test_without_an_accelerometer_nothing_is_said(recording):
-    assert beside.tilt(*fitted(without(recording, ["specific_force"]))) is None
+    assert accelerometer.tilt(*fitted(without(recording, ["specific_force"]))) is None
 
 
 def test_a_calm_flight_has_no_gusts(recording):

@@ -10,7 +10,7 @@ from diagnosis_parts import DRAG, WIND, ZERO_TRIM
 from crazyem.diagnosis.diagnose import Diagnosis, diagnose
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import start_noise
-from crazyem.diagnosis.naming import alternatives
+from crazyem.diagnosis.naming import place_rivals
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.settings import CONFIDENCE
 from crazyem.diagnosis.workers import Workers
@@ -81,14 +81,14 @@ def asked(
     data.twin = lambda: data
 
     def fitted(flights, at, accepted):
-        assert list(accepted) == ([WIND, DRAG] if "wind" in at.effects else [DRAG, alternatives.FORCE])
+        assert list(accepted) == ([WIND, DRAG] if "wind" in at.effects else [DRAG, place_rivals.FORCE])
         return SimpleNamespace(point=at, candidates=tuple(accepted), loglik=named if WIND in accepted else force)
 
-    monkeypatch.setattr(alternatives, "left_by_place", lambda data, point: left)
-    monkeypatch.setattr(alternatives, "refine_base", fitted)
-    monkeypatch.setattr(alternatives, "with_torque_memory_refit", lambda data, at: at)
-    monkeypatch.setattr(alternatives, "_finding", lambda data, found, nats: SimpleNamespace(nats=nats))
-    found, finding = alternatives.by_place(data, None, selection)
+    monkeypatch.setattr(place_rivals, "left_by_place", lambda data, point: left)
+    monkeypatch.setattr(place_rivals, "refine_base", fitted)
+    monkeypatch.setattr(place_rivals, "with_torque_memory_refit", lambda data, at: at)
+    monkeypatch.setattr(place_rivals, "_finding", lambda data, found, nats: SimpleNamespace(nats=nats))
+    found, finding = place_rivals.by_place(data, None, selection)
     assert (finding is None) == (found is selection)
     assert finding is None or finding.nats == force - named - 9  # twelve parameters against three
     return found

@@ -11,7 +11,7 @@ from made_flight import without
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.nuisances import refine_base
-from crazyem.diagnosis.naming.prune import ratio, with_accepted_effects, without_worse_predictions
+from crazyem.diagnosis.naming.prediction_check import ratio, with_accepted_effects, without_worse_predictions
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.prediction.horizon import UNITS, HorizonErrors
 from crazyem.diagnosis.settings import SELECTION

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.fit import nominal
 from crazyem.diagnosis.fitting.model import Noise, Point
-from crazyem.diagnosis.naming.unexplained import (
+from crazyem.diagnosis.locating.random_torques import (
     amplitude_of,
     block_covariances,
     erratic_rotor,

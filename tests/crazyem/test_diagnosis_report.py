@@ -20,7 +20,8 @@ from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.diagnosis.prediction.horizon import HORIZONS, Windows
 from crazyem.diagnosis.report import Series, write_report
 from crazyem.diagnosis.report.content import text_of
-from crazyem.diagnosis.report.html import data_uri, report, thinned
+from crazyem.diagnosis.report.html import report
+from crazyem.diagnosis.report.pictures import data_uri, thinned
 from crazyem.diagnosis.report.verdict import claim, quantity, span, verdict
 from crazyem.errors import UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE

@@ -14,9 +14,9 @@ from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, with_torque_mem
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import start_noise
 from crazyem.diagnosis.fitting.nuisances import held_out_fit, held_out_twin, nuisances, refine_base, with_nuisances
-from crazyem.diagnosis.naming import prune
+from crazyem.diagnosis.locating.random_torques import peaks
+from crazyem.diagnosis.naming import prune, starting_points
 from crazyem.diagnosis.naming import select as selecting
-from crazyem.diagnosis.naming import starting_points as onset
 from crazyem.diagnosis.naming.evidence import joint_gain
 from crazyem.diagnosis.naming.select import (
     Basis,
@@ -30,7 +30,6 @@ from crazyem.diagnosis.naming.select import (
 )
 from crazyem.diagnosis.naming.starting_points import ONSET, date, onset_of
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
-from crazyem.diagnosis.naming.unexplained import peaks
 from crazyem.diagnosis.workers import Workers
 
 ONSET_TIME = 4.37  # s
@@ -220,10 +219,10 @@ def test_after_a_wrong_effect_is_left_out_what_it_had_hidden_is_found(
     monkeypatch.setattr(selecting, "best_starting_points", lambda data, point, accepted, candidates: candidates)
     monkeypatch.setattr(selecting, "fitted_trial", fitted_trial)
     monkeypatch.setattr(selecting, "constrained_basis", lambda basis, candidate: basis)
-    for module in (selecting, onset):
+    for module in (selecting, starting_points):
         monkeypatch.setattr(module, "held_out_value", lambda held_out, point, accepted: (held_out, nats(point)[1]))
         monkeypatch.setattr(module, "refine_with_memory", fit)
-    monkeypatch.setattr(onset, "date", lambda data, fitted, candidate: (fitted, candidate))
+    monkeypatch.setattr(starting_points, "date", lambda data, fitted, candidate: (fitted, candidate))
     monkeypatch.setattr(prune, "refine_base", fit)
     monkeypatch.setattr(prune, "held_out_twin", lambda held_out, point, accepted: held_out)
     monkeypatch.setattr(prune, "held_out_fit", lambda held, point, accepted: SimpleNamespace(loglik=nats(point)[1]))

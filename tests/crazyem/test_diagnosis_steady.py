@@ -11,17 +11,18 @@ from diagnosis_parts import LAG, LOAD, ZERO_TRIM, rotor, silent
 from made_flight import changed
 
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fitting import noise as sweeps
+from crazyem.diagnosis.fitting import sweeps
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, nominal
 from crazyem.diagnosis.fitting.model import Noise, Point
 from crazyem.diagnosis.fitting.noise import start_noise
-from crazyem.diagnosis.fitting.nuisances import mean_torque, refine_base
+from crazyem.diagnosis.fitting.nuisances import refine_base
+from crazyem.diagnosis.fitting.sampling import mean_torque
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import select as selecting
 from crazyem.diagnosis.naming import steady as steadying
 from crazyem.diagnosis.naming.evidence import _inverse
-from crazyem.diagnosis.naming.other_likelihoods import push_of
+from crazyem.diagnosis.naming.gusts import push_of
 from crazyem.diagnosis.naming.select import Basis, shortlist, step_of
 from crazyem.diagnosis.naming.steady import steady_rivals, with_exact_torques, without_trim_rivals
 from crazyem.diagnosis.naming.trials import Selection, Trial, preferred

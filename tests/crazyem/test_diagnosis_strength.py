@@ -9,10 +9,11 @@ from diagnosis_parts import THRUST, start_point
 
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fitting.candidates import OfRecordings, of_recordings
+from crazyem.diagnosis.fitting.days import THRUST_SD
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import OWN, Point, deviations, of_recording
 from crazyem.diagnosis.fitting.noise import start_noise
-from crazyem.diagnosis.fitting.nuisances import THRUST_SD, nuisances, refine_base, with_thrust_scales
+from crazyem.diagnosis.fitting.nuisances import nuisances, refine_base, with_thrust_scales
 from crazyem.diagnosis.flights.flight import Flight, flight_of
 from crazyem.diagnosis.settings import FITTING
 

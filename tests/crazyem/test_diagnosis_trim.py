@@ -15,15 +15,8 @@ from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Noise, Point
 from crazyem.diagnosis.fitting.noise import start_noise
-from crazyem.diagnosis.fitting.nuisances import (
-    fast_share,
-    mean_torque,
-    nuisances,
-    refine_base,
-    with_zero_trim,
-    without,
-    without_unobservable,
-)
+from crazyem.diagnosis.fitting.nuisances import nuisances, refine_base, without, without_unobservable
+from crazyem.diagnosis.fitting.sampling import fast_share, mean_torque, with_zero_trim
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming.balance import balance_of, explanations
 from crazyem.diagnosis.naming.evidence import usual_gusts

@@ -13,10 +13,12 @@ import pytest
 from crazyem.control.trajectories import hover
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
-from crazyem.live.clock import FirmwareClock, SetpointStream
-from crazyem.live.flight_result import build_summary, check_writable, figure_of, live_line, text_summary, write_json
+from crazyem.live.clock import FirmwareClock
 from crazyem.live.history import MOST_ESTIMATES, SETTLE_SECONDS, History, Push, Track
+from crazyem.live.plot import figure_of
 from crazyem.live.simulator import Simulator
+from crazyem.live.stream import SetpointStream
+from crazyem.live.summary import build_summary, check_writable, live_line, text_summary, write_json
 from crazyem.notebook import saved
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import load_vehicle

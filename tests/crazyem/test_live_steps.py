@@ -15,11 +15,11 @@ from crazyem.estimation.online import OnlineEstimator
 from crazyem.estimation.result import Step
 from crazyem.estimation.steps import StepAwareEstimator, largest_jump
 from crazyem.live.controllers import LEE
-from crazyem.live.flight_result import build_summary, text_summary
 from crazyem.live.guard import Guard
 from crazyem.live.history import History
 from crazyem.live.pipeline import Pipeline, steps_of
 from crazyem.live.scheduler import UpdateThrottle
+from crazyem.live.summary import build_summary, text_summary
 from crazyem.recordings import open_recording
 from crazyem.vehicle import Vehicle
 

@@ -9,7 +9,8 @@ from fake_flight import FakeFlight
 from crazyem.errors import CrazyemError
 from crazyem.estimation.steps import LATEST_DECISION
 from crazyem.live.policy import EndRules, HealthLimits, MonitorLimits, Policy, WriteRules
-from crazyem.live.telemetry import CRASHED, FLYING, LOCKED, TUMBLED, Telemetry, WriteGate
+from crazyem.live.telemetry import CRASHED, FLYING, LOCKED, TUMBLED, Telemetry
+from crazyem.live.write_gate import WriteGate
 from crazyem.signals.sample import Sample
 
 WRONG = {"mass": 0.045}  # believed with confidence, within every bound: what a stuck or biased sensor does

@@ -15,7 +15,7 @@ import synthetic
 
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.estimation.verdict import ROTATION_UNEXPLAINED
-from crazyem.live.pipeline import FlightMonitor
+from crazyem.live.flight_monitor import FlightMonitor
 from crazyem.live.policy import FaultRules
 from crazyem.monitoring import detector
 from crazyem.monitoring.columns import Columns, RowMaker, mixing

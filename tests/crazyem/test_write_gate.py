@@ -19,8 +19,9 @@ from crazyem.live.history import History
 from crazyem.live.policy import EndRules, Policy, WriteRules
 from crazyem.live.push import Pusher
 from crazyem.live.session import Session
-from crazyem.live.telemetry import FLYING, Telemetry, WriteGate
-from crazyem.live.telemetry import FRESH_TELEMETRY_SECONDS as FRESH
+from crazyem.live.telemetry import FLYING, Telemetry
+from crazyem.live.write_gate import FRESH_TELEMETRY_SECONDS as FRESH
+from crazyem.live.write_gate import WriteGate
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import load_vehicle
 

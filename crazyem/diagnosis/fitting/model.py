@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from crazyem.diagnosis.fitting import specific_force
-from crazyem.diagnosis.fitting.noise import Noise, Swept, run_sweep
 from crazyem.diagnosis.fitting.situation import (
     causal_middle,
     impulses,
@@ -21,6 +20,7 @@ from crazyem.diagnosis.fitting.situation import (
     with_interpolated_states,
     with_rotors,
 )
+from crazyem.diagnosis.fitting.sweeps import Noise, Swept, run_sweep
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.settings import NOISE
 from crazyem.diagnosis.workers import Workers

@@ -1,19 +1,13 @@
-"""Nuisances: parameters that no vehicle file gives exactly, so they are always free, with priors; fits with them.
-
-A drone differs from day to day: a battery sits elsewhere, propellers and feet are bent. The vehicle file may give the
-size of these differences (`Days`, from healthy flights). Otherwise the prior of the effect `trim` gives it, from other
-drones. Commands of real drones that shake are faster than their sampling, which is an error of the torques.
-"""
+"""Nuisances: parameters that no vehicle file gives exactly, so they are always free, with priors; fits with them."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate, of_recordings
+from crazyem.diagnosis.fitting.days import day_freedom, day_sd, trim_known
 from crazyem.diagnosis.fitting.fit import (
     Data,
     DivergedError,
@@ -25,110 +19,16 @@ from crazyem.diagnosis.fitting.fit import (
 )
 from crazyem.diagnosis.fitting.gram import Solution, used
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.sampling import interval, unlogged_share
 from crazyem.diagnosis.flights.flight import Flight
-from crazyem.diagnosis.settings import FITTING, RECORDINGS
+from crazyem.diagnosis.settings import FITTING
 from crazyem.physics.effects import rotors
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effect
 from crazyem.physics.effects.prior import Conditions, Prior
 from crazyem.physics.effects.sensing import GYRO_BIAS
-from crazyem.physics.effects.timing import LOOP, MOTOR_LAG
-from crazyem.physics.rotors import wrench
+from crazyem.physics.effects.timing import MOTOR_LAG
 from crazyem.vehicle import Vehicle
-
-_REAL = Conditions(file_effects=frozenset({TRIM}))
-TRIM_SD = tuple(rotors.TRIM.prior.usual_in(_REAL).values())  # m, torque over thrust about x, y, z
-THRUST_SD = rotors.THRUST_SCALE.prior.usual_in(_REAL)["scale"]  # relative
-
-
-def trim_known(vehicle: Vehicle) -> bool:
-    """Whether the file has the drone's own trim; a trim of 0 only says that the drone is real."""
-    return any(float(v) for v in vehicle.effects.get(TRIM, {}).values())
-
-
-def day_sd(vehicle: Vehicle) -> tuple[float, ...]:
-    """Standard deviations from day to day of thrust (relative) and of trim about x, y, z [m]."""
-    if vehicle.days is not None:
-        return (vehicle.days.thrust_sd, *vehicle.days.trim_sd)
-    return (THRUST_SD, *TRIM_SD)
-
-
-def day_freedom(vehicle: Vehicle) -> float:
-    """Degrees of freedom of Student's t distribution of the deviations of a day."""
-    days = vehicle.days
-    return rotors.TRIM.prior.freedom_in(_REAL) if days is None else FITTING.prior_flights + days.flights - 1.0
-
-
-def unlogged_share(flights: Sequence[Flight], vehicle: Vehicle) -> float:
-    """Relative error of torques (0 to 1) that commands between the logged ones may cause; 0 if negligible.
-
-    White commands have half of their power above half of the Nyquist frequency. So the white part is twice the fast
-    share. Only one in period / `LOOP` of these commands is logged. An error in the input biases a fit by its power
-    times the weight of this power in the fit (Fuller, Measurement Error Models, 1987, 1.1), hence the square.
-
-    Commands contain the noise of the gyro, so their innovations correlate with its samples and with the rates between
-    samples. A model with free responses to six innovations gives inertias in eight flights with shares of 0.2 to 0.7
-    (benchmarks/concealed, random, seeds 21601 and 22601) standard deviations of 0.2 to 0.9. So such a log does not
-    know the torques any better.
-    """
-    shares = [0.0]
-    for flight in flights:
-        if not flight.inputs.measured:
-            missed = max(0.0, 1.0 - LOOP / interval(flight))
-            shares.append(min(1.0, 4.0 * missed * fast_share(flight, vehicle) ** 2))
-    return max(shares) if max(shares) > FITTING.min_sampled_torque else 0.0
-
-
-def interval(flight: Flight) -> float:
-    """Seconds between commands that the model uses: the longer interval of commands and of rows (`physics/lag.py`)."""
-    return float(max(np.median(np.diff(flight.inputs.time)), np.median(np.diff(flight.time))))
-
-
-def with_zero_trim(flights: Sequence[Flight], vehicle: Vehicle) -> Vehicle:
-    """The vehicle with a trim of 0, if its file has no trim, its commands shake like those of a real drone, and they
-    have a steady torque.
-
-    Such commands show little but their mean. The trim lets this mean differ as it does from drone to drone and from
-    day to day. Otherwise the mean looks like a weak rotor, a load or a wind.
-    """
-    shares = [fast_share(f, vehicle) for f in flights if not f.inputs.measured]
-    if TRIM in vehicle.effects or not shares or float(np.median(shares)) <= FITTING.coarse_share:
-        return vehicle
-    if not any(np.any(np.abs(mean_torque(f, vehicle)) > TRIM_SD) for f in flights):
-        return vehicle
-    return replace(vehicle, effects={**vehicle.effects, TRIM: dict.fromkeys("xyz", 0.0)})
-
-
-def mean_torque(flight: Flight, vehicle: Vehicle) -> NDArray:
-    """(3,) mean torque of the commands in the air over their mean thrust [m], body axes; it balances the trim."""
-    inside = (flight.inputs.time > flight.time[0]) & (flight.inputs.time < flight.time[-1])
-    mean = wrench(flight.inputs.thrust[inside], arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust).mean(0)
-    return mean[1:] / mean[0] if mean[0] > 0 else np.zeros(3)
-
-
-def fast_share(flight: Flight, vehicle: Vehicle) -> float:
-    """The larger share of power above half of the Nyquist frequency, of the commanded roll and pitch torques."""
-    return _fast_share(flight, vehicle.arm, vehicle.torque_per_thrust)
-
-
-@lru_cache(maxsize=64)
-def _fast_share(flight: Flight, arm: tuple[float, float], torque_per_thrust: float) -> float:
-    time = flight.inputs.time
-    inside = (time > flight.time[0] + RECORDINGS.edge) & (time < flight.time[-1] - RECORDINGS.edge)
-    if inside.sum() < 100:
-        return 0.0
-    period = interval(flight)
-    torque = wrench(flight.inputs.thrust[inside], arm=arm, torque_per_thrust=torque_per_thrust)[:, 1:3]
-    grid = np.arange(time[inside][0], time[inside][-1], period)
-    even = np.stack([np.interp(grid, time[inside], c) for c in torque.T])
-    window = np.hanning(grid.size)
-    power = np.abs(np.fft.rfft((even - even.mean(axis=1, keepdims=True)) * window)) ** 2
-    frequency = np.fft.rfftfreq(grid.size, period)
-    fast, all_of_it = (
-        power[:, frequency > 0.25 / period].sum(1),
-        power[:, frequency > FITTING.min_torque_frequency].sum(1),
-    )
-    return float(np.divide(fast, all_of_it, out=np.zeros(2), where=all_of_it > 0).max())
 
 
 def conditions_of(flights: Sequence[Flight], point: Point) -> Conditions:

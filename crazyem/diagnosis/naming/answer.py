@@ -13,9 +13,9 @@ from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import error_by_lag, solved, systematic_sd
-from crazyem.diagnosis.naming.alternatives import LOAD, WEAKER, load_substitutes
 from crazyem.diagnosis.naming.balance import Balance, decided_by_balance, log_odds_by_balance, rotor_loss
 from crazyem.diagnosis.naming.balance import steady as steadily
+from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, load_substitutes
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, preferred
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.diagnosis.settings import CONFIDENCE, LOADS, SELECTION

@@ -22,17 +22,10 @@ from scipy.optimize import lsq_linear, minimize, minimize_scalar
 from scipy.special import logit, logsumexp
 
 from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate
+from crazyem.diagnosis.fitting.days import day_freedom, day_sd, trim_known
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, refine
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.nuisances import (
-    day_freedom,
-    day_sd,
-    nuisances,
-    refine_base,
-    solved,
-    trim_known,
-    with_nuisances,
-)
+from crazyem.diagnosis.fitting.nuisances import nuisances, refine_base, solved, with_nuisances
 from crazyem.diagnosis.naming.alternatives import with_replacement
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.settings import CONFIDENCE, LOADS, SELECTION

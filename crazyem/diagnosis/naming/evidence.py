@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.days import day_sd
 from crazyem.diagnosis.fitting.fit import (
     Data,
     DivergedError,
@@ -19,7 +20,7 @@ from crazyem.diagnosis.fitting.fit import (
 )
 from crazyem.diagnosis.fitting.gram import bounded
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.nuisances import conditions_of, day_sd, nuisances
+from crazyem.diagnosis.fitting.nuisances import conditions_of, nuisances
 from crazyem.diagnosis.settings import LOADS, SELECTION
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.external_force import GUSTS

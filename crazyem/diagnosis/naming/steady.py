@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate
+from crazyem.diagnosis.fitting.days import day_sd
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, refine
 from crazyem.diagnosis.fitting.fit import nominal as nominal_of
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import start_noise
-from crazyem.diagnosis.fitting.nuisances import day_sd, nuisances, refine_base, with_nuisances, with_trim_noise, without
+from crazyem.diagnosis.fitting.nuisances import nuisances, refine_base, with_nuisances, with_trim_noise, without
 from crazyem.diagnosis.flights.flight import Flight, flight_of
 from crazyem.diagnosis.naming.balance import balance_of
 from crazyem.diagnosis.naming.starting_points import ONSET
