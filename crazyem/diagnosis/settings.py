@@ -30,7 +30,7 @@ class Recordings:
     # more in 51 simulated flights, 32 mV and more in 19 of CrazyPAD and NanoBench; 5 mV are 0.2 % of thrust
     nominal_voltage: float = 3.85  # V under load if none is recorded: middle of 3.7 to 4.0 V of a flight
     command_delay: float = 3.5e-3  # s; a command is held for 2 ms at 500 Hz, rates have a low pass of 80 Hz (2.8 ms)
-    rate_delay: float = 2.1e-3  # s of rates behind a recorded attitude (physics/effects/onboard_filter.py)
+    rate_delay: float = 2.1e-3  # s of rates behind a recorded attitude (physics/effects/onboard_estimate.py)
     stand_in_arm: float = 0.01  # m; arm, and torque per thrust, of a vehicle without rotors; its value cancels
     thrust_difference: float = 0.005  # relative; least difference between recordings that is reported; assumed
     hover_speed: float = 0.1  # m/s; horizontal, below which a flight hovers: hovers have 0.006 to 0.08, simulated

@@ -58,7 +58,7 @@ def test_a_failure_hides_its_moment_in_the_noise_until_it_is_fitted_again(failin
 
 
 def test_where_a_trim_is_known_only_what_sets_in_later_is_asked_of_rotors() -> None:
-    """What is steady the balance tells (`steady_odds.py`)."""
+    """What is steady the balance tells (`balance.py`)."""
     trimmed = replace(DRONE, effects={"trim": {"x": 1e-4, "y": -2e-4, "z": 3e-4}})
     data = data_of(fly(Hidden(thrust=(1, 1, 0.9, 1), onset=ONSET_TIME), seconds=8.0), vehicle=trimmed)
     point = nominal(data, Point(trimmed, {n: dict(v) for n, v in trimmed.effects.items()}, start_noise()))

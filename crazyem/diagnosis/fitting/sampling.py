@@ -22,11 +22,6 @@ def unlogged_share(flights: Sequence[Flight], vehicle: Vehicle) -> float:
     White commands have half of their power above half of the Nyquist frequency. So the white part is twice the fast
     share. Only one in period / `LOOP` of these commands is logged. An error in the input biases a fit by its power
     times the weight of this power in the fit (Fuller, Measurement Error Models, 1987, 1.1), hence the square.
-
-    Commands contain the noise of the gyro, so their innovations correlate with its samples and with the rates between
-    samples. A model with free responses to six innovations gives inertias in eight flights with shares of 0.2 to 0.7
-    (benchmarks/concealed, random, seeds 21601 and 22601) standard deviations of 0.2 to 0.9. So such a log does not
-    know the torques any better.
     """
     shares = [0.0]
     for flight in flights:

@@ -297,7 +297,7 @@ def steady_selection(
         size = _values(candidate, found[best][1], nominal)
         start = nominal.with_effects({candidate.effect: size})
         fitted = refine_base(data, start, [candidate])
-    except (DivergedError, np.linalg.LinAlgError):  # `hidden_by_the_day` reports this
+    except (DivergedError, np.linalg.LinAlgError):  # `hidden_by_daily_variation` reports this
         say("what is steady in these flights fits no model: neither a weak rotor nor a load is asked for")
         return None
     odds = float(logit(min(chance[best], 1.0 - 1e-12)))

@@ -98,7 +98,7 @@ class Prior:
         together: correlation of `own` between the parameters.
         systematic: systematic error of a parameter, which the scatter does not show; SI.
         relative_error: systematic error as a share of the parameter, or of the drone's mass if `per` is "mass".
-        relative_error_chaotic: `relative_error` in flights in which the effect is chaotic (`divergence.py`).
+        relative_error_chaotic: `relative_error` in flights in which the effect is chaotic (`Model.diverges`).
         usual_named: whether an effect of usual size is named, if it explains more than no effect.
         finding: (values, neutral values, conditions) -> whether the values are a finding, where a limit is not enough.
         detection_limit: distances from neutral that filters, sampling of a log and the air of a room imitate; smaller
