@@ -105,7 +105,14 @@ class WindowEM:
         )  # fmt: skip
 
     def full_pass(self, first: int, last: int) -> None:
-        """Filter and smooth the window with the present parameters."""
+        """Filter and smooth the window with the present parameters.
+
+        The position at the start of the window is unknown. A filter that took it from older rows could keep an error
+        for ever: a large error looks like a large noise of position, which gives the position no weight.
+        """
+        prior = self.tape.pp[first]
+        prior[:3], prior[:, :3] = 0.0, 0.0
+        prior[:3, :3] = np.diag(START_VARIANCE[:3])
         self.refill_inputs(first, last)
         self.forward(first, last, restart=True)
         self.backward(first, last)
