@@ -48,7 +48,7 @@ ATTITUDE_PERIOD = 0.05
 
 Filtered = Callable[[WindowEM, Parameters, int, int, "NDArray[np.float64] | None"], None]
 
-_COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
+STATE_COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 _INPUTS = ("motor_command", "rotor_speed", "wrench_command")
 
 
@@ -128,7 +128,7 @@ class OnlineEstimator:
         self._make_setup = partial(
             setup_for, vehicle, mass=mass, inertia=inertia, integration=integration, known_noise=known_noise
         )
-        self._measured = {**_COLUMNS, "specific_force": slice(13, 16)} if accelerometer else _COLUMNS
+        self._measured = {**STATE_COLUMNS, "specific_force": slice(13, 16)} if accelerometer else STATE_COLUMNS
         self._attitude_period, self._prediction_period = attitude_period, prediction_period
         self._attitude_time = self._rate_time = -math.inf  # s, newest attitude that is used, newest rates
         self._setup: Setup | None = None

@@ -19,6 +19,7 @@ from crazyem.live.policy import FaultRules
 from crazyem.monitoring.detector import Detector
 from crazyem.monitoring.fault import Fault
 from crazyem.monitoring.repetition import Pair, RunTest
+from crazyem.monitoring.state_age import StateAges
 from crazyem.notebook import finite
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle
@@ -67,6 +68,7 @@ class FlightMonitor:
         names = (*self._pairs, *self._pair_of)
         self._runs = {name: RunTest(SHARE_OF_RUNS * per_hour / len(names)) for name in names}
         self._stuck: dict[str, bool] = dict.fromkeys(names, False)
+        self._ages = StateAges()
         self._broken = -math.inf  # s, last time at which the model did not hold
         self.faults: tuple[Fault, ...] = ()
         self.suspended = ""
@@ -82,6 +84,7 @@ class FlightMonitor:
 
     def take(self, sample: Sample, *, airborne: bool) -> None:
         """One sample, before the estimator gets it."""
+        self._ages.add(sample.signal, sample.time, sample.value)
         test, name = self._runs.get(sample.signal), sample.signal
         if test is None:
             return
@@ -130,7 +133,7 @@ class FlightMonitor:
             self._detector.pause(float(em.tape.time[last - 1]))
             return
         known = np.where(em.setup.free, em.setup.prior.sd, 0.0) if sd is None else sd
-        report = self._detector.take(em, p, first, last, known)
+        report = self._detector.take(em, p, first, last, known, self._ages.at(em.tape.time[first:last]))
         if report is not None:
             self._report(report)
 

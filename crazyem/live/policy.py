@@ -93,7 +93,7 @@ class FaultRules:
         action: after a fault, one of `FAULT_ACTIONS`. resume: s for which the model must hold before pushes go on.
     """
 
-    enabled: bool = False
+    enabled: bool = True
     false_alarms_per_hour: float = 0.1
     action: str = "stop"
     resume: float = 2.0

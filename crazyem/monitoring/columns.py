@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from crazyem.estimation.model import Parameters
 from crazyem.estimation.tape import Tape
 from crazyem.monitoring import hypotheses as h
-from crazyem.physics.effects.onboard_estimate import LATERAL_SECONDS, path_errors
+from crazyem.physics.effects.onboard_estimate import LATERAL_SD, LATERAL_SECONDS, path_errors
 from crazyem.physics.rotors import PITCH_SIGN, ROLL_SIGN, YAW_SIGN
 from crazyem.vehicle import Vehicle
 
@@ -24,6 +24,7 @@ VELOCITY_SCALE_SD, RATE_SCALE_SD = 0.06, 0.02
 # parameters of the estimator, drag along x, y, z, delays of the four measured quantities, two scales, the error of an
 # onboard filter that knows no drag
 NUISANCES = 19
+PARAMETERS = 9  # of these, the parameters of the estimator, which come first
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,8 @@ class Columns:
         block: (C,) index of the first column of the same hypothesis.
         sd: (C,) standard deviations of the priors of the sizes.
         once: (C,) whether a column acts in the first step only.
+        onboard: (U,) columns that act on the onboard filter. seconds: (U,) time constants of its path. later: (U,)
+            whether a column is a delay of its fixes.
     """
 
     columns: tuple[h.Column, ...]
@@ -43,6 +46,9 @@ class Columns:
     block: NDArray[np.int64]
     sd: NDArray[np.float64]
     once: NDArray[np.bool_]
+    onboard: NDArray[np.int64]
+    seconds: NDArray[np.float64]
+    later: NDArray[np.bool_]
 
     @classmethod
     def of(cls, hypotheses: Sequence[h.Hypothesis]) -> "Columns":
@@ -51,7 +57,17 @@ class Columns:
         first = np.cumsum([0, *(len(hypothesis.columns) for hypothesis in hypotheses)])
         block = np.repeat(first[:-1], np.diff(first))
         sd = np.array([c.sd for c in columns])
-        return cls(columns, first, block, sd, np.array([c.kind in h.ONCE for c in columns]))
+        kinds = np.array([c.kind for c in columns])
+        onboard = np.flatnonzero(np.isin(kinds, h.ONBOARD))
+        # the time constant is known within a half: two columns of a delay have its mean less and plus its sd
+        seconds = [
+            LATERAL_SECONDS
+            + (0.0 if columns[i].kind == h.UNKNOWN_FORCE else (-LATERAL_SD, LATERAL_SD)[columns[i].index])
+            for i in onboard
+        ]
+        return cls(
+            columns, first, block, sd, np.isin(kinds, h.ONCE), onboard, np.array(seconds), kinds[onboard] == h.FIX_DELAY
+        )  # fmt: skip
 
 
 def mixing(vehicle: Vehicle) -> NDArray[np.float64]:
@@ -116,7 +132,7 @@ class RowMaker:
                 acting[:, c, 2] = -force / mass**2
             elif kind == h.CENTRE:  # from a centre of mass at (x, y), thrust acts at (-x, -y): torque (-y F, x F, 0)
                 acting[:, c, 3:] = (force if i == 0 else -force)[:, None] * inverse[:, 1 - i]
-            elif kind == h.FORCE:
+            elif kind in (h.FORCE, h.UNKNOWN_FORCE):
                 acting[:, c, :3] = turn[:, i, :] / mass
             elif kind == h.TORQUE:
                 acting[:, c, 3:] = inverse[:, i]

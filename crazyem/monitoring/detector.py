@@ -1,10 +1,11 @@
 """The running tests: every hypothesis in windows of several lengths; the posterior names a change.
 
-A window opens every `SPACING` s. It is kept while it is one of the newest few or its number is divisible by a power of
-two, so the lengths grow geometrically up to `LONGEST`. The statistic of each hypothesis and length is divided by its
-own scale without a change, because model errors make it larger than the theory of white innovations predicts. The scale
-comes from a finite number of windows, so the statistic has a Student's distribution, not a normal one. A window uses
-scales from before it opened, and parameters of slow errors from before the longest window opened.
+A window opens every `SPACING` s, and before a row that is far from its prediction. It is kept while it is one of the
+newest few or its number is divisible by a power of two, so the lengths grow geometrically up to `LONGEST`. The
+statistic of each hypothesis and length is divided by its own scale without a change, because model errors make it
+larger than the theory of white innovations predicts. The scale comes from a finite number of windows, so the statistic
+has a Student's distribution, not a normal one. A window uses scales from before it opened, and parameters of slow
+errors from before the longest window opened.
 """
 
 import math
@@ -16,12 +17,15 @@ from numpy.typing import NDArray
 
 from crazyem.estimation.em import WindowEM
 from crazyem.estimation.model import Parameters
+from crazyem.estimation.tape import Tape
 from crazyem.monitoring import kernels
-from crazyem.monitoring.columns import NUISANCES, Columns, RowMaker
+from crazyem.monitoring.columns import NUISANCES, Columns, RowMaker, lateness
 from crazyem.monitoring.fault import Fault, Size
 from crazyem.monitoring.hypotheses import hypotheses_for
+from crazyem.monitoring.nuisance_memory import NuisanceMemory
 from crazyem.monitoring.slow_error import LAGS, slow_error
 from crazyem.monitoring.threshold import threshold_for
+from crazyem.physics.effects.onboard_estimate import CORRECTION_SECONDS
 from crazyem.vehicle import Vehicle
 
 SPACING = 0.04  # s between openings of windows
@@ -68,6 +72,9 @@ class Detector:
         self.freedom = np.diff(self.columns.first)
         self._prior = self.columns.sd**-2.0
         self._followed = np.array([h.followed for h in self.hypotheses])
+        names = [h.name for h in self.hypotheses]
+        self._normal = np.array([h.normal for h in self.hypotheses])
+        self._log_prior = -np.log([names.count(n) for n in names])  # every name is equally probable
         each = false_alarms_per_hour / count
         longest = SPACING * LONGEST * ROWS_A_SECOND
         self.threshold = np.array([
@@ -77,11 +84,14 @@ class Detector:
         self.opened = np.zeros(WINDOWS)  # s, when each opened
         self.number = np.full(WINDOWS, -1)
         self.d, self.d_slow = np.zeros((WINDOWS, 12, size)), np.zeros((WINDOWS, 12, size))
+        self.path, self.turned = np.zeros((WINDOWS, 6, len(self.columns.onboard))), np.zeros((WINDOWS, 3))
         self.score = np.zeros((WINDOWS, size))
         self.among, self.cross = np.zeros((WINDOWS, size, size)), np.zeros((WINDOWS, size, NUISANCES))
         self.score_n, self.among_n = np.zeros(NUISANCES), np.zeros((NUISANCES, NUISANCES))
-        self.score_n_of = np.zeros((WINDOWS, NUISANCES))  # score_n when a window opened
+        # score_n and among_n when a window opened, less what was known of the nuisances then
+        self.score_n_of = np.zeros((WINDOWS, NUISANCES))
         self.among_n_of = np.zeros((WINDOWS, NUISANCES, NUISANCES))
+        self._memory = NuisanceMemory(COVARIANCE_MEMORY)
         self.drift = np.zeros((12, 1))
         self.n, self.n_slow, self.n_now = (np.zeros((12, NUISANCES)) for _ in range(3))
         self.e_slow, self.e_now = np.zeros(12), np.zeros(12)
@@ -105,13 +115,13 @@ class Detector:
 
     def _restart(self, time: float) -> None:
         self._maker.restart()
+        self._memory.restart()
         self._open: list[int] = []
         self._count = 0
         self._since = time
         self._newest = -math.inf
         self._found: tuple[float, float] | None = None  # s, detection and onset of a change
-        self._exceeded = False  # whether a test was above its threshold at the last judgement
-        self._reported = False
+        self._reported = self._sound = False  # whether a change was reported; whether it is a normal one
         self.drift[:], self.n[:], self.n_slow[:], self.e_slow[:] = 0.0, 0.0, 0.0, 0.0
 
     def pause(self, time: float) -> None:
@@ -124,12 +134,15 @@ class Detector:
 
     # rows -------------------------------------------------------------------------------------------------------
 
-    def take(self, em: WindowEM, p: Parameters, first: int, last: int, sd: NDArray[np.float64]) -> Fault | None:
+    def take(
+        self, em: WindowEM, p: Parameters, first: int, last: int, sd: NDArray[np.float64], ages: NDArray[np.float64]
+    ) -> Fault | None:
         """Take rows first..last-1 of the tape, just filtered for the first time; returns a report if there is one.
 
         Args:
             em: its tape and setup. p: the parameters that the rows were filtered with.
-            sd: (9,) standard deviations of theta, in its coordinates.
+            sd: (9,) standard deviations of theta, in its coordinates. ages: (last - first,) s, ages of the measured
+                states less the usual age.
         """
         tape = em.tape
         begin = first
@@ -142,16 +155,26 @@ class Detector:
         now = float(tape.time[last - 1])
         self._keep_reference(now, p, sd)
         _, reference, sd = self._reference
+        self._precision = self._maker.precision(sd)
         acting, sensed = self._maker.rows(tape, reference, begin, last)
         acting_n, sensed_n = self._maker.nuisances(tape, reference, em.setup.unit, begin, last)
         drifting = self._maker.drifting(tape, p, reference, begin, last)
-        slots = np.array(self._open, np.int64)
-        kernels.absorb(
-            begin, last, em.setup.lead, tape.time, tape.usable, tape.gain, tape.s, tape.e, tape.blocks, tape.middle,
-            acting, sensed, acting_n, sensed_n, drifting, self.drift, self.columns.once, self.columns.block, slots,
-            self.rows, self._slow[0], self.d, self.d_slow, self.n, self.n_slow, self.n_now, self.e_slow,
-            self.e_now, self.score, self.score_n, self.among, self.cross, self.among_n,
-        )  # fmt: skip
+        late = lateness(tape, begin, last) * ages[begin - first :, None]
+        motion = tape.xf[begin - 1 : last, [3, 4, 5, 10, 11, 12]]
+        late[:, 9:] = 0.0  # body rates are those of the gyro, which are new
+        split = self._jump(tape, begin, last)
+        for low, high in ((begin, split), (split, last)):
+            if low == split > begin:
+                self._renew(float(tape.time[split - 1]))
+            rows, slots = slice(low - begin, high - begin), np.array(self._open, np.int64)
+            kernels.absorb(
+                low, high, em.setup.lead, tape.time, tape.usable, tape.gain, tape.s, tape.e, tape.blocks, tape.middle,
+                acting[rows], sensed[rows], acting_n[rows], sensed_n[rows], drifting[rows], late[rows], self.drift,
+                self.columns.once, self.columns.block, self.columns.onboard, self.columns.seconds, self.columns.later,
+                CORRECTION_SECONDS, motion[low - begin : high - begin + 1], slots, self.rows, self._slow[0], self.d,
+                self.path, self.turned, self.d_slow, self.n, self.n_slow, self.n_now, self.e_slow, self.e_now,
+                self.score, self.score_n, self.among, self.cross, self.among_n,
+            )  # fmt: skip
         if self._found is None:
             kernels.correlate(
                 begin, last, tape.time, tape.s, tape.e, COVARIANCE_MEMORY, CLIPPED, LAGS, self.past, self.seen,
@@ -162,8 +185,9 @@ class Detector:
         passed = min(now - self._newest, 1.0) if math.isfinite(self._newest) else SPACING
         self._newest = now
         begun = self._open[0] if self._open else -1
+        self._memory.add(passed, self.score_n, self.among_n)
         kernels.judge(  # also without windows, so that it is compiled before a flight
-            slots, self.columns.first, self._prior, self._prior / NORMAL_SHARE**2, self._maker.precision(sd),
+            slots, self.columns.first, self._prior, self._prior / NORMAL_SHARE**2, self._precision,
             self.score, self.score_n - self.score_n_of[begun], self.among, self.cross,
             self.among_n - self.among_n_of[begun], self.excess, self.statistic, self.determinant, self.size,
             self.variance,
@@ -173,6 +197,19 @@ class Detector:
         if self._found is None and now - self._since > LEARNING:
             self._renew(now)
         return report
+
+    def _jump(self, tape: Tape, begin: int, last: int) -> int:
+        """The first row after `begin` with an innovation beyond `CLIPPED`, if the tests run; else `begin`.
+
+        A sensor that jumps does so at one row. A window that opens some rows before expects it there, and finds
+        nothing.
+        """
+        if not self._open or self._found is not None:
+            return begin
+        rows = slice(begin + 1, last)
+        beyond = tape.e[rows] ** 2 > CLIPPED**2 * self.covariances[0] * tape.s[rows]
+        far = np.flatnonzero((beyond & (tape.s[rows] > 0.0)).any(1))
+        return begin + 1 + int(far[0]) if len(far) else begin
 
     def _keep_reference(self, now: float, newest: Parameters, sd: NDArray[np.float64]) -> None:
         """Update the reference parameters of the innovations; an estimator that follows a change must not hide it.
@@ -195,10 +232,11 @@ class Detector:
                 keep.append(w)
         free = next(w for w in range(WINDOWS) if w not in keep)
         self.rows[free], self.opened[free], self.number[free] = 0, now, self._count
-        for array in (self.d, self.d_slow, self.score, self.among, self.cross):
+        for array in (self.d, self.path, self.turned, self.d_slow, self.score, self.among, self.cross):
             array[free] = 0.0
         self.scale_of[free], self.known_of[free] = self.scale, self.known
-        self.score_n_of[free], self.among_n_of[free] = self.score_n, self.among_n
+        earlier, known = self._memory.sums(self._precision, float(self.scale[-1].mean()))
+        self.score_n_of[free], self.among_n_of[free] = self.score_n - earlier, self.among_n - known
         self._open = [*keep, free]
 
     # decisions --------------------------------------------------------------------------------------------------
@@ -216,14 +254,13 @@ class Detector:
         seconds = np.maximum(SPACING * 4.0 * 2.0**levels, REGIME)
         freedom = SCALE_FREEDOM + (np.minimum(self.known_of[slots, levels], SCALE_MEMORY) / seconds)[:, None]
         normal = freedom * np.log1p(excess / (scale * freedom))
-        over = normal / self.threshold
+        over = np.where(self._normal, 0.0, normal / self.threshold)
         if self._found is not None:
             return self._settle(now, slots, scale)
         self.holds = bool(over.max() <= 1.0)
         if self.holds:
             self._learn(levels, excess, passed)
-        if self.holds or not self._exceeded:  # a single row that deviates is no change: later rows contradict it
-            self._exceeded = not self.holds
+        if self.holds:
             return None
         report = self._report(now, slots, scale, settled=False)
         self._found = (now, report.onset)
@@ -237,17 +274,15 @@ class Detector:
         larger value is used.
         """
         d = self.freedom
-        for level in range(LEVELS):
-            mine = statistic[levels == level]
-            if not len(mine):
-                continue
-            mine = np.minimum(mine, CLIPPED**2 * self.scale[level] * d)
-            powers = np.stack([mine.mean(0), (mine**2).mean(0), (mine**3).mean(0)])
-            memory = min(SCALE_WEIGHT + self.known[level], SCALE_MEMORY)
-            self.moments[:, level] += passed / memory * (powers - self.moments[:, level])
-            first, second, third = self.moments[:, level]
-            self.scale[level] = np.maximum(np.maximum(first / d, third / (second * (d + 4.0))), 1.0)
-            self.known[level] += passed
+        mine = np.minimum(statistic, (CLIPPED**2 * self.scale * d)[levels])
+        members = levels == np.arange(LEVELS)[:, None]
+        count = members.sum(1)
+        powers = members @ np.stack([mine, mine**2, mine**3]) / np.maximum(count, 1)[:, None]
+        rate = passed / np.minimum(SCALE_WEIGHT + self.known, SCALE_MEMORY) * (count > 0)
+        self.moments += rate[:, None] * (powers - self.moments)
+        first, second, third = self.moments
+        self.scale = np.maximum(np.maximum(first / d, third / (second * (d + 4.0))), 1.0)
+        self.known += passed * (count > 0)
 
     def _settle(self, now: float, slots: NDArray[np.int64], scale: NDArray[np.float64]) -> Fault | None:
         assert self._found is not None
@@ -265,6 +300,10 @@ class Detector:
         assert self._found is not None
         detected, _ = self._found
         if report.probability < CLEAR and now - detected < UNCLEAR:
+            return None
+        if self._sound:
+            self._restart(now)
+            self.holds = True
             return None
         self._reported = True
         self._found = (detected, report.onset)
@@ -285,24 +324,28 @@ class Detector:
         noise = np.maximum(scale, scale[at, k]) + SIGNATURE_ERROR**2 * statistic[near].max()
         determinant = np.maximum(self.determinant[slots] - self.freedom * np.log(noise), 0.0)
         evidence = np.where(near[:, None], 0.5 * (statistic / noise - determinant), -np.inf)
-        by_hypothesis = evidence.max(0)
+        by_hypothesis = evidence.max(0) + self._log_prior
         posterior = np.exp(by_hypothesis - by_hypothesis.max())
         posterior /= posterior.sum()
         best = int(np.argmax(by_hypothesis))
         row = int(np.argmax(evidence[:, best]))
         w = int(slots[row])
         chosen = self.hypotheses[best]
+        self._sound = chosen.normal
+        of_name: dict[str, float] = {}
+        for h, p in zip(self.hypotheses, posterior):
+            of_name[h.name] = of_name.get(h.name, 0.0) + float(p)
         lo = int(self.columns.first[best])
         sizes = {}
         for i, column in enumerate(chosen.columns):
             value, sd = float(self.size[w, lo + i]), math.sqrt(noise[row, best] * float(self.variance[w, lo + i]))
             sizes[column.label] = Size(value, (value - 1.96 * sd, value + 1.96 * sd), column.unit)
         others = {
-            h.name: float(p)
-            for h, p in sorted(zip(self.hypotheses, posterior), key=lambda item: -item[1])
-            if h is not chosen and p > RULED_OUT
+            name: p
+            for name, p in sorted(of_name.items(), key=lambda item: -item[1])
+            if name != chosen.name and p > RULED_OUT
         }
         return Fault(
-            chosen.effect, chosen.rotor, chosen.text, float(self.opened[w]), detected, sizes, float(posterior[best]),
+            chosen.effect, chosen.rotor, chosen.text, float(self.opened[w]), detected, sizes, of_name[chosen.name],
             others, settled, followed=bool(posterior[self._followed].sum() > RULED_OUT),
         )  # fmt: skip

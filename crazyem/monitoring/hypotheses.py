@@ -6,6 +6,7 @@ has its name. A column acts on the body (force, torque), on a sensor, or as a si
 
 from dataclasses import dataclass
 
+from crazyem.estimation.in_step import PERIOD
 from crazyem.physics.effects import sensing
 from crazyem.physics.effects.external_force import WIND
 from crazyem.physics.effects.mass_properties import PAYLOAD
@@ -15,6 +16,8 @@ from crazyem.vehicle import Vehicle
 # Kinds of column; the second number of a column is its axis or rotor.
 ROTOR, MASS, CENTRE, THRUST, FORCE, TORQUE, KICK, TURN = range(8)  # acts on the body
 POSITION, VELOCITY, ATTITUDE, RATE, VELOCITY_SCALE, RATE_SCALE = range(8, 14)  # acts on a sensor
+UNKNOWN_FORCE, FIX_DELAY = 14, 15  # acts on the onboard filter: a force it does not know; later fixes of the pose
+ONBOARD = (UNKNOWN_FORCE, FIX_DELAY)
 ONCE = (KICK, TURN)
 
 
@@ -37,10 +40,13 @@ class Column:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A possible change, with the columns that change together; all hypotheses have the same prior probability.
+    """A possible change, with the columns that change together; all names have the same prior probability.
+
+    A change that an onboard filter either knows or does not know is two hypotheses of one name.
 
     Attributes:
         effect: name; rotor: 1 to 4, or None. text: words for people.
+        normal: whether it also happens in a sound flight, and is not reported.
         followed: whether the estimator restarts by itself and finds the new value, so that pushes need not stop.
     """
 
@@ -49,6 +55,7 @@ class Hypothesis:
     columns: tuple[Column, ...]
     rotor: int | None = None
     followed: bool = False
+    normal: bool = False
 
     @property
     def name(self) -> str:
@@ -83,6 +90,7 @@ def hypotheses_for(vehicle: Vehicle) -> tuple[Hypothesis, ...]:
             Column(MASS, 0, "mass", "kg", 0.2 * vehicle.mass), *_axes(CENTRE, "x y", "m", 0.1 * arm),
         ), followed=True),
         Hypothesis(WIND.name, "a force set in", _axes(FORCE, "force_x force_y force_z", "N", 0.05 * weight)),
+        Hypothesis(WIND.name, "a force set in", _axes(UNKNOWN_FORCE, "force_x force_y force_z", "N", 0.05 * weight)),
         Hypothesis(TRIM.name, "a torque set in", (
             *_axes(TORQUE, "torque_x torque_y torque_z", "N m", 0.05 * weight * arm),
         )),
@@ -101,5 +109,10 @@ def hypotheses_for(vehicle: Vehicle) -> tuple[Hypothesis, ...]:
         )),
         Hypothesis("gyro_scale", "body rates have another scale", (Column(RATE_SCALE, 0, "scale_error", "", 0.5),)),
     )  # fmt: skip
+    # The firmware's filter adds a fix to the newest prediction, which is up to 10 ms old (PERIOD). Where a prediction
+    # slips past a fix, this age jumps.
+    slip = Hypothesis("pose_delay", "fixes of the pose became later", (
+        *(Column(FIX_DELAY, i, "delay", "s", PERIOD) for i in range(2)),
+    ), normal=True)  # fmt: skip
     geometry = vehicle.arm[0] > 0 and vehicle.arm[1] > 0 and vehicle.torque_per_thrust > 0
-    return (*(rotors if geometry else ()), *body, *sensors)
+    return (*(rotors if geometry else ()), *body, *sensors, slip)

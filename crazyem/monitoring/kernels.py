@@ -38,10 +38,55 @@ def _step(d, scratch, blocks, dt, h, middle, acting, act, once, new):
 
 
 @compiled
+def _relaxation(dt, seconds, turn_seconds, left):
+    """Into left (U + 1, 3): decay, cosine and sine of the onboard filter's errors in a step; last that of attitudes."""
+    for c in range(len(seconds)):
+        part = dt / seconds[c]
+        left[c, 0], left[c, 1], left[c, 2] = np.exp(-part), np.cos(part), np.sin(part)
+    left[-1, 0] = np.exp(-dt / turn_seconds)
+
+
+@compiled
+def _filter_errors(path, turned, left, middle, acting, onboard, seconds, later, before, now, new, error):
+    """Errors (9, C) of the onboard filter's position, velocity and attitude after one step, by changes of size one.
+
+    A change is a force that the filter does not know (`path_error` in physics/effects/onboard_estimate.py), or a delay
+    of the fixes of the pose: then position and attitude tend to values that are ahead by the motion in this time.
+
+    Args:
+        path: (6, U) errors of position and velocity by the columns `onboard` (U,), for delays less the motion ahead.
+            turned: (3,) likewise of the attitude. Both are updated.
+        left: (U + 1, 3) of `_relaxation`. seconds, later: (U,) time constants of the path; whether it is a delay.
+        before, now: (6,) velocity [m/s] and body rate [rad/s] at both ends of the step. new: whether the change is at
+            the start of the step.
+    """
+    for i in range(3):
+        turned[i] = left[-1, 0] * (-before[3 + i] if new else turned[i]) - (now[3 + i] - before[3 + i])
+    for c in range(len(onboard)):
+        a, time = onboard[c], seconds[c]
+        decay, cosine, sine = left[c, 0], left[c, 1], left[c, 2]
+        for i in range(3):
+            drive = 0.0
+            if later[c]:
+                if new:
+                    path[i, c] = -before[i]
+            else:
+                drive = -(middle[i, 0] * acting[a, 0] + middle[i, 1] * acting[a, 1])
+            last_p, last_v = 0.5 * time * time * drive, time * drive
+            p, v = path[i, c] - last_p, path[3 + i, c] - last_v
+            path[i, c] = last_p + decay * (cosine * p + sine * (time * v - p))
+            path[3 + i, c] = last_v + decay * (cosine * v + sine * (v - 2.0 * p / time))
+            error[i, a], error[3 + i, a] = path[i, c], path[3 + i, c]
+            if later[c]:
+                path[i, c] -= now[i] - before[i]
+                error[i, a] = path[i, c] + now[i]
+                error[6 + i, a] = turned[i] + now[3 + i]
+
+
+@compiled
 def absorb(first, last, lead, time, usable, gain, s, e, blocks, middle, acting, sensed, acting_n, sensed_n, drifting,
-           drift, once, block,
-           slots, rows, slow, d, d_slow, n, n_slow, n_now, e_slow, e_now, score, score_n, among, cross,
-           among_n):  # fmt: skip
+           late, drift, once, block, onboard, seconds, later, turn_seconds, motion, slots, rows, slow, d, path, turned,
+           d_slow, n, n_slow, n_now, e_slow, e_now, score, score_n, among, cross, among_n):  # fmt: skip
     """Add rows first..last-1 of the tape to the sums of every open window.
 
     Args:
@@ -49,6 +94,9 @@ def absorb(first, last, lead, time, usable, gain, s, e, blocks, middle, acting, 
             `Columns`.
         drifting (k, 1, 6): changes of the model's accelerations since its reference. drift: (12, 1) their effect on the
             filter's state; with it, innovations are corrected to those of the reference.
+        motion: (k + 1, 6) velocity and body rate at both ends of the steps; onboard, seconds, later, turn_seconds: see
+            `_filter_errors` and `_relaxation`, with path (W, 6, U) and turned (W, 3).
+        late: (k, 12) known errors of measurements that are older than usual; innovations are corrected likewise.
         slots: (w,) indices of the open windows. rows: (W,) number of rows in each, updated.
         slow: (3, 12) of the slow errors: decay, gain, 1 over the standard deviation of the rest.
         d, d_slow: (W, 12, C) state errors by changes, and predicted signatures; n, n_slow: (12, M) those of nuisances.
@@ -64,6 +112,8 @@ def absorb(first, last, lead, time, usable, gain, s, e, blocks, middle, acting, 
     part = np.empty(nuisances)
     never = np.zeros(nuisances, np.bool_)
     scratch_1 = np.empty((12, 1))
+    error = np.zeros((9, size))
+    decays = np.zeros((len(onboard) + 1, 3))
     for k in range(first, last):
         dt = time[k] - time[k - 1]
         h = lead * dt
@@ -74,7 +124,7 @@ def absorb(first, last, lead, time, usable, gain, s, e, blocks, middle, acting, 
             if s[k, i] == 0.0:
                 continue
             root = 1.0 / np.sqrt(s[k, i])
-            moved = drift[i, 0]
+            moved = drift[i, 0] - late[k - first, i]
             f, q, r = phi[i], learnt[i], weight[i]
             v = (e[k, i] + moved) * root - e_slow[i]
             e_now[i] = r * v
@@ -94,11 +144,16 @@ def absorb(first, last, lead, time, usable, gain, s, e, blocks, middle, acting, 
                 score_n[a] += v * e_now[i]
                 for b in range(a + 1):
                     among_n[a, b] += v * n_now[i, b]
+        _relaxation(dt, seconds, turn_seconds, decays)
         for at in range(len(slots)):
             w = slots[at]
             dw = d[w]
             _step(dw, scratch, blocks[k], dt, h, middle[k], acting[k - first], True, once, rows[w] == 0)
             rows[w] += 1
+            _filter_errors(
+                path[w], turned[w], decays, middle[k], acting[k - first], onboard, seconds, later, motion[k - first],
+                motion[k - first + 1], rows[w] == 1, error,
+            )  # fmt: skip
             for i in range(12):
                 if s[k, i] == 0.0:
                     continue
@@ -106,6 +161,9 @@ def absorb(first, last, lead, time, usable, gain, s, e, blocks, middle, acting, 
                 f, q, r = phi[i], learnt[i], weight[i]
                 for a in range(size):
                     now[a] = dw[i, a] + sensed[k - first, a, i]
+                if i < 9:
+                    for a in range(size):
+                        now[a] += error[i, a]
                 for j in range(12):
                     g = gain[k, i, j]
                     dj = dw[j]
@@ -175,7 +233,8 @@ def judge(slots, first, prior, normal, prior_n, score, score_n, among, cross, am
           size, variance):  # fmt: skip
     """Test statistics of every hypothesis in every open window, with the nuisances integrated out.
 
-    Nuisances act before and after a change: score_n (M,) and among_n (M, M) are those of the oldest window.
+    Nuisances act before and after a change: score_n (M,) and among_n (M, M) are those of the oldest window and the
+    flight before it.
 
     Args:
         first (H + 1,): columns of each hypothesis. prior (C,): precisions of the sizes after a change. normal (C,): of

@@ -168,6 +168,19 @@ def test_a_gap_is_a_break_and_not_a_step(flight, lost):
         within(final, name, true)
 
 
+def test_a_jump_of_position_does_not_make_positions_worthless_for_ever():
+    """A window that begins after the jump must not keep the position of the filter from before, and call that noise."""
+    flight = synthetic.samples(synthetic.fly(TRUTH, seed=4, duration=12.0))
+    noise = []
+    for jump in (0.0, 0.3):
+        estimator = OnlineEstimator(LAGGED, window=400)
+        for s in flight:
+            hit = s.signal == "position" and s.time >= 4.0
+            estimator.feed(replace(s, value=(s.value[0] + jump, *s.value[1:])) if hit else s)
+        noise.append(estimator.finish().noise["position"])
+    assert noise[1] < 1.1 * noise[0]
+
+
 def test_on_the_ground_nothing_is_identifiable_and_nothing_is_used():
     estimator = OnlineEstimator(LAGGED)
     rng = np.random.default_rng(0)

@@ -118,23 +118,41 @@ def test_a_sensor_that_is_biased_is_named(flight: list[Sample]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("judgements", "reported"), [(1, False), (2, True)])
-def test_a_change_is_reported_by_two_judgements_in_a_row(
-    flight: list[Sample], monkeypatch: pytest.MonkeyPatch, judgements: int, reported: bool
+@pytest.mark.parametrize("rows", range(4))
+def test_a_sensor_that_jumps_between_two_judgements_is_named(flight: list[Sample], rows: int) -> None:
+    jump = ONSET + 0.01 * rows
+    moved = (
+        replace(s, value=(s.value[0] + 0.1, *s.value[1:])) if s.signal == "position" and s.time >= jump else s
+        for s in flight
+    )
+    reports, _ = monitored(moved)
+    assert reports[0].effect == "position_offset"
+    assert reports[0].onset == pytest.approx(jump, abs=0.015)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("normal", [True, False])
+def test_fixes_that_become_later_are_no_fault(
+    flight: list[Sample], monkeypatch: pytest.MonkeyPatch, normal: bool
 ) -> None:
-    judge, above = Detector._judge, iter([False] * 20 + [True] * judgements)
-
-    def lowered(self: Detector, *arguments: Any) -> Fault | None:
-        """Judge against thresholds near 0 where a test must be above its threshold."""
-        kept = self.threshold
-        if next(above, False):
-            self.threshold = np.full_like(kept, 1e-9)
-        found = judge(self, *arguments)
-        self.threshold = kept
-        return found
-
-    monkeypatch.setattr(Detector, "_judge", lowered)
-    assert bool(monitored(s for s in flight if s.time < 12.0)[0]) is reported
+    """A flight at 1.8 m/s (another inertial frame of the same one) whose onboard filter follows fixes 20 ms ahead."""
+    known = detector.hypotheses_for
+    monkeypatch.setattr(
+        detector, "hypotheses_for", lambda v: tuple(replace(h, normal=h.normal and normal) for h in known(v))
+    )
+    speed, error, time = np.array([1.5, 1.0, 0.0]), np.zeros((2, 3)), ONSET
+    late: list[Sample] = []
+    for sample in flight:
+        while time < sample.time:  # Euler steps of p' = v - 2 (p - ahead) / T and v' = -2 (p - ahead) / T^2
+            away = error[0] - 0.02 * speed
+            error += 1e-3 * np.stack([error[1] - 2 / 0.15 * away, -2 / 0.15**2 * away])
+            time += 1e-3
+        added = {"position": speed * sample.time + error[0], "velocity": speed + error[1]}.get(sample.signal)
+        value = sample.value if added is None else tuple((np.array(sample.value) + added).tolist())
+        late.append(replace(sample, value=value))
+    reports, monitor = monitored(late)
+    assert [r.effect for r in reports[:1]] == ["pose_delay"] * (not normal)
+    assert monitor.stops(SECONDS) == "" or not normal
 
 
 @pytest.mark.slow

@@ -43,7 +43,32 @@ class Made:
         self.sensed_n = random.standard_normal((n, m, 12)) * (np.arange(m) == 1)[None, :, None]
         self.once = np.array([False, False, True, False])
         self.block = np.array([0, 1, 1, 1])
+        # column 1 is a force that the onboard filter does not know, column 3 a delay of its fixes
+        self.onboard, self.seconds, self.later = np.array([1, 3]), np.array([0.05, 0.03]), np.array([False, True])
+        self.turn_seconds, self.motion = 0.02, random.standard_normal((n + 1, 6))
         self.slow = np.stack([random.uniform(-0.3, 0.8, 12), random.uniform(0, 1, 12), random.uniform(0.5, 1.5, 12)])
+
+    def filter_errors(self) -> NDArray:
+        """(n, C, 12) errors of the onboard filter by columns 1 and 3: the linear systems in small steps.
+
+        Between rows the delayed motion is constant, and it changes at the end of a step.
+        """
+        out, t = np.zeros_like(self.sensed), self.time
+        for a, time, later in zip(self.onboard, self.seconds, self.later):
+            rate = np.array([[-2 / time, 1.0], [-2 / time**2, 0.0]])
+            error, turned = np.zeros((2, 3)), np.zeros(3)
+            for k in range(1, self.n + 1):
+                ahead = self.motion[k - 1] if later else np.zeros(6)
+                drive = np.zeros(3) if later else -self.middle[k][:, :2] @ self.acting[k - 1, a, :2]
+                pull = np.stack([2 / time * ahead[:3], drive + 2 / time**2 * ahead[:3]])
+                step = (t[k] - t[k - 1]) / 1000
+                for _ in range(1000):
+                    middle = error + 0.5 * step * (rate @ error + pull)
+                    error = error + step * (rate @ middle + pull)
+                    half = turned + 0.5 * step * (ahead[3:] - turned) / self.turn_seconds
+                    turned = turned + step * (ahead[3:] - half) / self.turn_seconds
+                out[k - 1, a] = np.concatenate([error.ravel(), turned, np.zeros(3)])
+        return out
 
     def signatures(self, acting: NDArray, sensed: NDArray, once: NDArray) -> NDArray:
         """(n, 12, C) what each column adds to the normalised innovations, NaN where nothing was measured."""
@@ -86,32 +111,36 @@ class Made:
 def test_sums_are_those_of_plain_numpy(seed: int) -> None:
     made = Made(seed)
     c, m, n = 4, made.m, made.n
+    late = np.random.default_rng([seed, 1]).standard_normal((n, 12))
     arrays = {
-        "d": np.zeros((3, 12, c)), "d_slow": np.zeros((3, 12, c)), "n": np.zeros((12, m)),
+        "d": np.zeros((3, 12, c)), "path": np.zeros((3, 6, 2)), "turned": np.zeros((3, 3)),
+        "d_slow": np.zeros((3, 12, c)), "n": np.zeros((12, m)),
         "n_slow": np.zeros((12, m)), "n_now": np.zeros((12, m)), "e_slow": np.zeros(12), "e_now": np.zeros(12),
         "score": np.zeros((3, c)), "score_n": np.zeros(m), "among": np.zeros((3, c, c)),
         "cross": np.zeros((3, c, m)), "among_n": np.zeros((m, m)),
     }  # fmt: skip
-    rows = np.zeros(3, np.int64)
+    rows, drift = np.zeros(3, np.int64), np.zeros((12, 1))
     for first, last in ((1, 4), (4, n + 1)):  # in two parts, as updates come
         kernels.absorb(
             first, last, 0.5, made.time, made.usable, made.gain, made.s, made.e, made.blocks, made.middle,
             made.acting[first - 1 : last - 1], made.sensed[first - 1 : last - 1], made.acting_n[first - 1 : last - 1],
-            made.sensed_n[first - 1 : last - 1], np.zeros((last - first, 1, 6)), np.zeros((12, 1)),
-            made.once, made.block, np.array([1]), rows, made.slow, *arrays.values(),
+            made.sensed_n[first - 1 : last - 1], np.zeros((last - first, 1, 6)), late[first - 1 : last - 1], drift,
+            made.once, made.block, made.onboard, made.seconds, made.later, made.turn_seconds,
+            made.motion[first - 1 : last], np.array([1]), rows, made.slow, *arrays.values(),
         )  # fmt: skip
-    mine = made.whitened(made.signatures(made.acting, made.sensed, made.once)).reshape(-1, c)
+    sensed = made.sensed + made.filter_errors()
+    mine = made.whitened(made.signatures(made.acting, sensed, made.once)).reshape(-1, c)
     nuisance = made.whitened(
         made.signatures(made.acting_n, made.sensed_n, np.zeros(m, bool))
     ).reshape(-1, m)  # fmt: skip
-    left = made.whitened(
-        np.where(made.s[1:] > 0, made.e[1:] / np.sqrt(np.where(made.s[1:] > 0, made.s[1:], 1.0)), np.nan)
-    ).ravel()
+    error = made.signatures(np.zeros((n, 1, 6)), late[:, None], np.zeros(1, bool))[..., 0]  # of measurements
+    measured = np.where(made.s[1:] > 0, made.e[1:] / np.sqrt(np.where(made.s[1:] > 0, made.s[1:], 1.0)), np.nan)
+    left = made.whitened(measured - error).ravel()
     inside = made.block[:, None] == made.block[None, :]
-    np.testing.assert_allclose(arrays["score"][1], mine.T @ left, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(arrays["score"][1], mine.T @ left, rtol=1e-6, atol=1e-7)
     np.testing.assert_allclose(arrays["score_n"], nuisance.T @ left, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(arrays["cross"][1], mine.T @ nuisance, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(np.tril(arrays["among"][1]), np.tril(mine.T @ mine * inside), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(arrays["cross"][1], mine.T @ nuisance, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(np.tril(arrays["among"][1]), np.tril(mine.T @ mine * inside), rtol=1e-6, atol=1e-7)
     np.testing.assert_allclose(np.tril(arrays["among_n"]), np.tril(nuisance.T @ nuisance), rtol=1e-9, atol=1e-12)
     assert rows[1] == n
     assert not arrays["score"][[0, 2]].any()
