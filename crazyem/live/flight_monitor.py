@@ -129,8 +129,9 @@ class FlightMonitor:
         # are implausible because of this fault.
         unexplained = not self.faults and bool(implausible_inertia(p.theta, em.setup).any())
         self.suspended = ROTATION_UNEXPLAINED if unexplained else ""
-        if unexplained:
-            self._detector.pause(float(em.tape.time[last - 1]))
+        stuck = any(self._stuck.values())  # explains every deviation meanwhile
+        if unexplained or stuck:
+            self._detector.pause(float(em.tape.time[last - 1]), found=stuck)
             return
         known = np.where(em.setup.free, em.setup.prior.sd, 0.0) if sd is None else sd
         report = self._detector.take(em, p, first, last, known, self._ages.at(em.tape.time[first:last]))

@@ -124,12 +124,12 @@ class Detector:
         self._reported = self._sound = False  # whether a change was reported; whether it is a normal one
         self.drift[:], self.n[:], self.n_slow[:], self.e_slow[:] = 0.0, 0.0, 0.0, 0.0
 
-    def pause(self, time: float) -> None:
+    def pause(self, time: float, *, found: bool = False) -> None:
         """Drop all windows and learn from `time` [s] on, as the model of the estimator does not describe the drone.
 
-        A change that was found keeps its windows until its second report.
+        A change that was found keeps its windows until its second report, unless `found` drops it, too.
         """
-        if self._found is None:
+        if found or self._found is None:
             self._restart(time)
 
     # rows -------------------------------------------------------------------------------------------------------
