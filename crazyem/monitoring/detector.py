@@ -21,7 +21,7 @@ from crazyem.estimation.tape import Tape
 from crazyem.monitoring import kernels
 from crazyem.monitoring.columns import NUISANCES, Columns, RowMaker, lateness
 from crazyem.monitoring.fault import Fault, Size
-from crazyem.monitoring.hypotheses import hypotheses_for
+from crazyem.monitoring.hypotheses import NORMAL_SHARE, hypotheses_for
 from crazyem.monitoring.nuisance_memory import NuisanceMemory
 from crazyem.monitoring.slow_error import LAGS, slow_error
 from crazyem.monitoring.threshold import threshold_for
@@ -45,10 +45,6 @@ SETTLED = 1.0  # s after the onset, time of the second report
 LEAST_SETTLING = 0.3  # s after the detection, earliest time of the second report
 NEAR_ONSET = 0.2  # s, largest change of the onset after the detection
 SIGNATURE_ERROR = 0.1  # relative error of signatures, as parameters are known within some per cent
-# Sizes without a fault over the typical sizes of a change. The estimate of an onboard filter wanders: in undisturbed
-# flights (benchmarks/monitor) its velocity by 1.5 cm/s, the scale of its velocity by 2 %, its position by 5 mm. That is
-# 2 to 5 % of a typical change. A report needs eight times the normal size.
-NORMAL_SHARE = 0.01
 CLEAR, UNCLEAR = 0.95, 0.2  # probability from which a change is reported; s after which it is reported anyway
 RULED_OUT = 0.05  # probability below which a hypothesis is no look-alike
 
@@ -69,8 +65,10 @@ class Detector:
         self.columns = Columns.of(self.hypotheses)
         self._maker = RowMaker(self.columns, vehicle)
         size, count = len(self.columns.columns), len(self.hypotheses)
-        self.freedom = np.diff(self.columns.first)
+        changes = np.array([not c.wander for c in self.columns.columns])
+        self.freedom = np.add.reduceat(changes.astype(np.int64), self.columns.first[:-1])
         self._prior = self.columns.sd**-2.0
+        self._usual = np.where(changes, self._prior / NORMAL_SHARE**2, self._prior)  # precisions without a change
         self._followed = np.array([h.followed for h in self.hypotheses])
         names = [h.name for h in self.hypotheses]
         self._normal = np.array([h.normal for h in self.hypotheses])
@@ -187,7 +185,7 @@ class Detector:
         begun = self._open[0] if self._open else -1
         self._memory.add(passed, self.score_n, self.among_n)
         kernels.judge(  # also without windows, so that it is compiled before a flight
-            slots, self.columns.first, self._prior, self._prior / NORMAL_SHARE**2, self._precision,
+            slots, self.columns.first, self._prior, self._usual, self._precision,
             self.score, self.score_n - self.score_n_of[begun], self.among, self.cross,
             self.among_n - self.among_n_of[begun], self.excess, self.statistic, self.determinant, self.size,
             self.variance,
@@ -199,26 +197,30 @@ class Detector:
         return report
 
     def _jump(self, tape: Tape, begin: int, last: int) -> int:
-        """The first row after `begin` with an innovation beyond `CLIPPED`, if the tests run; else `begin`.
+        """The row with the largest innovation if it is beyond `CLIPPED` and the tests run; else `begin`.
 
         A sensor that jumps does so at one row. A window that opens some rows before expects it there, and finds
         nothing.
         """
         if not self._open or self._found is not None:
             return begin
-        rows = slice(begin + 1, last)
-        beyond = tape.e[rows] ** 2 > CLIPPED**2 * self.covariances[0] * tape.s[rows]
-        far = np.flatnonzero((beyond & (tape.s[rows] > 0.0)).any(1))
-        return begin + 1 + int(far[0]) if len(far) else begin
+        s = tape.s[begin:last]
+        squares = tape.e[begin:last] ** 2 / (self.covariances[0] * np.where(s > 0.0, s, math.inf))
+        row = int(squares.max(1).argmax())
+        return begin + row if squares[row].max() > CLIPPED**2 else begin
 
     def _keep_reference(self, now: float, newest: Parameters, sd: NDArray[np.float64]) -> None:
         """Update the reference parameters of the innovations; an estimator that follows a change must not hide it.
 
-        They are the newest ones while the estimator learns, then those of up to `REFERENCE` s ago. After a detection
-        they are kept.
+        They are the newest ones while the estimator learns, then those of up to `REFERENCE` s ago, or older ones that
+        are better known: after a supposed step of mass the estimator has only a few rows. After a detection they are
+        kept.
         """
-        young = now - self._since < LEARNING
-        if self._found is None and (young or now - self._reference[0] > REFERENCE):
+        start, _, known = self._reference
+        age = now - start
+        if self._found is None and (
+            now - self._since < LEARNING or (age > REFERENCE and (sd <= known * age / REFERENCE).all())
+        ):
             self._reference = (now, newest, sd)
 
     def _renew(self, now: float) -> None:
@@ -323,7 +325,11 @@ class Detector:
         at, k = np.unravel_index(int(np.argmax(np.where(near[:, None], statistic / scale, 0.0))), statistic.shape)
         noise = np.maximum(scale, scale[at, k]) + SIGNATURE_ERROR**2 * statistic[near].max()
         determinant = np.maximum(self.determinant[slots] - self.freedom * np.log(noise), 0.0)
-        evidence = np.where(near[:, None], 0.5 * (statistic / noise - determinant), -np.inf)
+        # The noise weakens the data, not the prior: the likelihood ratio at sizes x is S'x - x'Jx / 2 over the noise,
+        # less x' prior x / 2. With S = (J + prior) x, the best multiple of x gives this:
+        squared = np.add.reduceat(self.size[slots] ** 2 * self._prior, self.columns.first[:-1], axis=1)
+        fit = statistic**2 / noise / np.maximum(statistic + (noise - 1.0) * squared, 1e-300)
+        evidence = np.where(near[:, None], 0.5 * (fit - determinant), -np.inf)
         by_hypothesis = evidence.max(0) + self._log_prior
         posterior = np.exp(by_hypothesis - by_hypothesis.max())
         posterior /= posterior.sum()
@@ -337,7 +343,7 @@ class Detector:
             of_name[h.name] = of_name.get(h.name, 0.0) + float(p)
         lo = int(self.columns.first[best])
         sizes = {}
-        for i, column in enumerate(chosen.columns):
+        for i, column in enumerate(c for c in chosen.columns if not c.wander):
             value, sd = float(self.size[w, lo + i]), math.sqrt(noise[row, best] * float(self.variance[w, lo + i]))
             sizes[column.label] = Size(value, (value - 1.96 * sd, value + 1.96 * sd), column.unit)
         others = {
