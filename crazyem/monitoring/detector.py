@@ -49,6 +49,18 @@ CLEAR, UNCLEAR = 0.95, 0.2  # probability from which a change is reported; s aft
 RULED_OUT = 0.05  # probability below which a hypothesis is no look-alike
 
 
+def weakened(statistic: NDArray[np.float64], unusual: NDArray[np.float64], noise: NDArray[np.float64]) -> Any:
+    """The statistic of data whose noise is larger by a factor `noise` in variance, while the prior is what it is.
+
+    Twice the logarithm of the likelihood ratio at sizes x is (2 S'x - x'Jx) / noise - x' prior x. With the likeliest
+    sizes, S = (J + prior) x, the best multiple of x gives this.
+
+    Args:
+        statistic: S' (J + prior)^-1 S. unusual: x' prior x.
+    """
+    return statistic**2 / noise / np.maximum(statistic + (noise - 1.0) * unusual, 1e-300)
+
+
 class Detector:
     """Takes filtered rows of the tape and reports changes; the same rows give the same reports.
 
@@ -325,11 +337,8 @@ class Detector:
         at, k = np.unravel_index(int(np.argmax(np.where(near[:, None], statistic / scale, 0.0))), statistic.shape)
         noise = np.maximum(scale, scale[at, k]) + SIGNATURE_ERROR**2 * statistic[near].max()
         determinant = np.maximum(self.determinant[slots] - self.freedom * np.log(noise), 0.0)
-        # The noise weakens the data, not the prior: the likelihood ratio at sizes x is S'x - x'Jx / 2 over the noise,
-        # less x' prior x / 2. With S = (J + prior) x, the best multiple of x gives this:
-        squared = np.add.reduceat(self.size[slots] ** 2 * self._prior, self.columns.first[:-1], axis=1)
-        fit = statistic**2 / noise / np.maximum(statistic + (noise - 1.0) * squared, 1e-300)
-        evidence = np.where(near[:, None], 0.5 * (fit - determinant), -np.inf)
+        unusual = np.add.reduceat(self.size[slots] ** 2 * self._prior, self.columns.first[:-1], axis=1)
+        evidence = np.where(near[:, None], 0.5 * (weakened(statistic, unusual, noise) - determinant), -np.inf)
         by_hypothesis = evidence.max(0) + self._log_prior
         posterior = np.exp(by_hypothesis - by_hypothesis.max())
         posterior /= posterior.sum()

@@ -269,6 +269,34 @@ def test_an_onboard_filter_that_knows_no_drag_is_a_nuisance() -> None:
     np.testing.assert_allclose(error((1, 2, 3, 50, 51, rows)), whole, rtol=1e-12)
 
 
+@pytest.mark.parametrize("noise", [1.0, 30.0, 1000.0])
+def test_weaker_data_leave_the_prior_as_it_is(noise: float) -> None:
+    """By maximising over multiples of the most probable sizes."""
+    random = np.random.default_rng(6)
+    root, score, prior = random.standard_normal((3, 3)), 30.0 * random.standard_normal(3), np.diag([0.5, 2.0, 9.0])
+    information = root @ root.T
+    size = np.linalg.solve(information + prior, score)
+    factors = np.linspace(0.0, 1.5, 300_001)
+    unusual = size @ prior @ size
+    ratio = (2 * factors * (score @ size) - factors**2 * (size @ information @ size)) / noise - factors**2 * unusual
+    assert detector.weakened(score @ size, unusual, np.array(noise)) == pytest.approx(ratio.max(), rel=1e-6)
+
+
+def test_a_reference_is_replaced_by_one_that_is_as_well_known() -> None:
+    found = Detector(load_vehicle("cf2"))
+    first, second, third = (cast(Any, SimpleNamespace(name=i)) for i in range(3))
+    found._since = 0.0
+    found._keep_reference(7.0, first, np.full(9, 0.01))  # while it learns: always
+    found._keep_reference(10.0, second, np.full(9, 0.05))  # after a supposed step of mass: few rows
+    assert found._reference[1] is first
+    found._keep_reference(8.5, second, np.full(9, 0.01))  # too early
+    assert found._reference[1] is first
+    found._keep_reference(10.0, second, np.full(9, 0.01))
+    assert found._reference[1] is second
+    found._keep_reference(21.0, third, np.full(9, 0.05))  # worse, but the other one is old
+    assert found._reference[1] is third
+
+
 @pytest.mark.parametrize("per_hour", [0.01, 1.0])
 def test_thresholds_follow_the_rate_of_false_alarms(per_hour: float) -> None:
     usual = Detector(load_vehicle("cf2"))
