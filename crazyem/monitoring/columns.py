@@ -24,7 +24,7 @@ VELOCITY_SCALE_SD, RATE_SCALE_SD = 0.06, 0.02
 # parameters of the estimator, drag along x, y, z, delays of the four measured quantities, two scales, the error of an
 # onboard filter that knows no drag
 NUISANCES = 19
-PARAMETERS = 9  # of these, the parameters of the estimator, which come first
+LASTING = (9, 10, 11, 18)  # of these, the drags: constants of the drone, which the estimator does not have
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
-"""What the flight before the windows tells of the nuisances: discounted sums of their scores and information.
+"""What the flight before the windows tells of the drag: discounted sums of scores and information.
 
-Drag, delays and scales are those of the drone and of its filter, so 20 s of flight know them better than 2.6 s of
-windows. Without this memory, an unknown drag explains a wind in any flight at a constant speed.
+Drag is a constant of the drone, so 20 s of flight know it better than 2.6 s of windows. Without this memory, an unknown
+drag explains a wind in any flight at a constant speed. Delays and scales of measurements are not remembered: they
+depend on the motion, as errors of an onboard filter look like a delay or a scale.
 """
 
 import math
@@ -9,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.monitoring.columns import NUISANCES, PARAMETERS
+from crazyem.monitoring.columns import LASTING, NUISANCES
 
 
 class NuisanceMemory:
@@ -36,19 +37,20 @@ class NuisanceMemory:
         self._counted = (score.copy(), among.copy())
 
     def sums(self, precision: NDArray[np.float64], scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Score (M,) and information (M, M, lower triangle) of the nuisances that are no parameters of the estimator.
+        """Score (M,) and information (M, M) of the lasting nuisances, with the others integrated out.
 
-        The estimator renews its parameters, so these are integrated out. Scores of innovations that are not white vary
+        Scores of innovations that are not white vary
         by `scale` times more than their information says, so both are divided by it.
 
         Args:
             precision: (M,) of the prior. scale: 1 for white innovations.
         """
-        p = PARAMETERS
-        among, score = np.zeros_like(self._among), np.zeros_like(self._score)
-        lower, cross = self._among[:p, :p], self._among[p:, :p].T
-        inner = lower + np.tril(lower, -1).T + np.diag(precision[:p])
-        weight = np.linalg.solve(inner, np.column_stack([cross, self._score[:p]]))
-        among[p:, p:] = (self._among[p:, p:] - cross.T @ weight[:, :-1]) / scale
-        score[p:] = (self._score[p:] - cross.T @ weight[:, -1]) / scale
+        own, others = np.array(LASTING), np.setdiff1d(np.arange(NUISANCES), LASTING)
+        whole = self._among + np.tril(self._among, -1).T
+        cross = whole[np.ix_(others, own)]
+        inner = whole[np.ix_(others, others)] + np.diag(precision[others])
+        weight = np.linalg.solve(inner, np.column_stack([cross, self._score[others]]))
+        among, score = np.zeros_like(whole), np.zeros_like(self._score)
+        among[np.ix_(own, own)] = (whole[np.ix_(own, own)] - cross.T @ weight[:, :-1]) / scale
+        score[own] = (self._score[own] - cross.T @ weight[:, -1]) / scale
         return score, among
