@@ -98,7 +98,8 @@ def warm_up(vehicle: Vehicle) -> float:
     """Run every kernel once; returns the seconds if any kernel was compiled, 0.0 if all came from the disk."""
     begun, before = time.monotonic(), compilations()
     estimator = OnlineEstimator(vehicle, window=100, every=4, prediction_period=PERIOD)
-    FlightMonitor(vehicle, FaultRules()).watch(estimator)
+    monitor = FlightMonitor(vehicle, FaultRules())
+    monitor.watch(estimator)
     hover = 0.5
     try:
         for i in range(160):
@@ -114,7 +115,9 @@ def warm_up(vehicle: Vehicle) -> float:
                 ("body_rate", (s, s, s)),
                 ("specific_force", (s, s, 9.81)),
             ):
-                estimator.feed(Sample(name, t, value))
+                sample = Sample(name, t, value)
+                monitor.take(sample, airborne=False)
+                estimator.feed(sample)
         estimator.finish()
     except CrazyemError:
         pass  # these artificial data may be refused; only the compilation matters
