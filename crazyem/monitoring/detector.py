@@ -77,10 +77,10 @@ class Detector:
         self.columns = Columns.of(self.hypotheses)
         self._maker = RowMaker(self.columns, vehicle)
         size, count = len(self.columns.columns), len(self.hypotheses)
-        changes = np.array([not c.wander for c in self.columns.columns])
+        changes = np.array([c.changes for c in self.columns.columns])
         self.freedom = np.add.reduceat(changes.astype(np.int64), self.columns.first[:-1])
         self._prior = self.columns.sd**-2.0
-        self._usual = np.where(changes, self._prior / NORMAL_SHARE**2, self._prior)  # precisions without a change
+        self._usual = np.array([c.usual or NORMAL_SHARE * c.sd for c in self.columns.columns]) ** -2.0
         self._followed = np.array([h.followed for h in self.hypotheses])
         names = [h.name for h in self.hypotheses]
         self._normal = np.array([h.normal for h in self.hypotheses])
@@ -352,7 +352,7 @@ class Detector:
             of_name[h.name] = of_name.get(h.name, 0.0) + float(p)
         lo = int(self.columns.first[best])
         sizes = {}
-        for i, column in enumerate(c for c in chosen.columns if not c.wander):
+        for i, column in enumerate(c for c in chosen.columns if c.changes):
             value, sd = float(self.size[w, lo + i]), math.sqrt(noise[row, best] * float(self.variance[w, lo + i]))
             sizes[column.label] = Size(value, (value - 1.96 * sd, value + 1.96 * sd), column.unit)
         others = {

@@ -20,9 +20,12 @@ UNKNOWN_FORCE, FIX_DELAY = 14, 15  # acts on the onboard filter: a force it does
 ONBOARD = (UNKNOWN_FORCE, FIX_DELAY)
 ONCE = (KICK, TURN)
 # Sizes without a fault over the typical sizes of a change. The estimate of an onboard filter wanders: in undisturbed
-# flights (benchmarks/monitor) its velocity by 1.5 cm/s, the scale of its velocity by 2 %, its position by 5 mm. That is
-# 2 to 5 % of a typical change. A report needs eight times the normal size.
+# flights (benchmarks/monitor) its velocity by 1.5 cm/s, its position by 5 mm. That is 3 to 5 % of a typical change. A
+# report needs eight times the normal size.
 NORMAL_SHARE = 0.01
+# Force of a draught [N]: 0.15 m/s (ISO 7730: 0.1 to 0.2 m/s indoors) on a drag of 7 mN s/m (Foerster 2015: 3 to 9).
+DRAUGHT = 1e-3
+SCALE_WANDER = 0.02  # of the scale of velocities of an onboard filter in undisturbed flights (benchmarks/monitor)
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,8 @@ class Column:
         kind, index: kind of column, and its axis (0 to 2: x, y, z) or rotor (0 to 3).
         label: of the size in a report. unit: of the size.
         sd: standard deviation of the prior of the size, in this unit: a typical size of the change.
-        wander: whether this is no change but what a sound signal does, too; then `sd` is the size of that.
+        usual: standard deviation of what happens in a sound flight, too; 0 for `NORMAL_SHARE` of `sd`. A column whose
+            usual size is `sd` is no change, but makes others less sure.
     """
 
     kind: int
@@ -41,7 +45,12 @@ class Column:
     label: str
     unit: str
     sd: float
-    wander: bool = False
+    usual: float = 0.0
+
+    @property
+    def changes(self) -> bool:
+        """Whether the column is a change."""
+        return self.usual < self.sd
 
 
 @dataclass(frozen=True)
@@ -69,12 +78,12 @@ class Hypothesis:
         return self.effect if self.rotor is None else f"{self.effect} {self.rotor}"
 
 
-def _axes(kind: int, labels: str, unit: str, sd: float) -> tuple[Column, ...]:
-    return tuple(Column(kind, i, label, unit, sd) for i, label in enumerate(labels.split()))
+def _axes(kind: int, labels: str, unit: str, sd: float, usual: float = 0.0) -> tuple[Column, ...]:
+    return tuple(Column(kind, i, label, unit, sd, usual) for i, label in enumerate(labels.split()))
 
 
 def _wander(columns: tuple[Column, ...]) -> tuple[Column, ...]:
-    return tuple(replace(c, sd=NORMAL_SHARE * c.sd, wander=True) for c in columns)
+    return tuple(replace(c, sd=NORMAL_SHARE * c.sd, usual=NORMAL_SHARE * c.sd) for c in columns)
 
 
 def hypotheses_for(vehicle: Vehicle) -> tuple[Hypothesis, ...]:
@@ -85,6 +94,7 @@ def hypotheses_for(vehicle: Vehicle) -> tuple[Hypothesis, ...]:
     """
     weight = vehicle.mass * 9.81
     arm = max(vehicle.arm) or 0.05
+    force = ("force_x force_y force_z", "N", 0.05 * weight, DRAUGHT)
     rotors = tuple(
         Hypothesis(ROTOR_FAULT.name, f"rotor {k + 1} lost thrust", (Column(ROTOR, k, "loss", "", 0.3),), k + 1)
         for k in range(4)
@@ -99,8 +109,8 @@ def hypotheses_for(vehicle: Vehicle) -> tuple[Hypothesis, ...]:
         Hypothesis("payload_off_centre", "mass and its centre changed", (
             Column(MASS, 0, "mass", "kg", 0.2 * vehicle.mass), *_axes(CENTRE, "x y", "m", 0.1 * arm),
         ), followed=True),
-        Hypothesis(WIND.name, "a force set in", _axes(FORCE, "force_x force_y force_z", "N", 0.05 * weight)),
-        Hypothesis(WIND.name, "a force set in", _axes(UNKNOWN_FORCE, "force_x force_y force_z", "N", 0.05 * weight)),
+        Hypothesis(WIND.name, "a force set in", _axes(FORCE, *force)),
+        Hypothesis(WIND.name, "a force set in", _axes(UNKNOWN_FORCE, *force)),
         Hypothesis(TRIM.name, "a torque set in", (
             *_axes(TORQUE, "torque_x torque_y torque_z", "N m", 0.05 * weight * arm),
         )),
@@ -116,7 +126,7 @@ def hypotheses_for(vehicle: Vehicle) -> tuple[Hypothesis, ...]:
         Hypothesis("attitude_offset", "the attitude jumped", _axes(ATTITUDE, "roll pitch yaw", "rad", 0.1)),
         Hypothesis(sensing.GYRO_BIAS.name, "the body rates are biased", rate),
         Hypothesis(sensing.VELOCITY_SCALE.name, "velocities have another scale", (
-            Column(VELOCITY_SCALE, 0, "scale_error", "", 0.5), *_wander(velocity),
+            Column(VELOCITY_SCALE, 0, "scale_error", "", 0.5, SCALE_WANDER), *_wander(velocity),
         )),
         Hypothesis("gyro_scale", "body rates have another scale", (
             Column(RATE_SCALE, 0, "scale_error", "", 0.5), *_wander(rate),
