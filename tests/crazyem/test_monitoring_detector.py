@@ -302,3 +302,12 @@ def test_thresholds_follow_the_rate_of_false_alarms(per_hour: float) -> None:
     usual = Detector(load_vehicle("cf2"))
     other = Detector(load_vehicle("cf2"), false_alarms_per_hour=per_hour)
     assert ((other.threshold > usual.threshold) == (per_hour < 0.1)).all()
+
+
+def test_what_wanders_without_a_change_is_no_degree_of_freedom() -> None:
+    found = Detector(load_vehicle("cf2"))
+    freedom = {h.name: int(d) for h, d in zip(found.hypotheses, found.freedom)}
+    assert (freedom["velocity_scale"], freedom["gyro_scale"], freedom["wind"], freedom["rotor_fault 1"]) == (1, 1, 3, 1)
+    wander = [not c.changes for h in found.hypotheses if h.name == "velocity_scale" for c in h.columns]
+    assert wander == [False, True, True, True]
+    assert (found._usual[found.columns.first[0]] > found._prior[found.columns.first[0]]).all()
