@@ -194,19 +194,22 @@ class Detector:
             return None
         passed = min(now - self._newest, 1.0) if math.isfinite(self._newest) else SPACING
         self._newest = now
-        begun = self._open[0] if self._open else -1
         self._memory.add(passed, self.score_n, self.among_n)
-        kernels.judge(  # also without windows, so that it is compiled before a flight
-            slots, self.columns.first, self._prior, self._usual, self._precision,
-            self.score, self.score_n - self.score_n_of[begun], self.among, self.cross,
-            self.among_n - self.among_n_of[begun], self.excess, self.statistic, self.determinant, self.size,
-            self.variance,
-        )  # fmt: skip
+        self._compute(slots)
         report = self._judge(now, passed, slots) if self._open else None
         self._slow.append(slow_error(self.covariances))
         if self._found is None and now - self._since > LEARNING:
             self._renew(now)
         return report
+
+    def _compute(self, slots: NDArray[np.int64]) -> None:
+        """Statistics and sizes of the open windows; also without any, so that it is compiled before a flight."""
+        begun = self._open[0] if self._open else -1
+        kernels.judge(
+            slots, self.columns.first, self._prior, self._usual, self._precision, self.score,
+            self.score_n - self.score_n_of[begun], self.among, self.cross, self.among_n - self.among_n_of[begun],
+            self.excess, self.statistic, self.determinant, self.size, self.variance,
+        )  # fmt: skip
 
     def _jump(self, tape: Tape, begin: int, last: int) -> int:
         """The row with the largest innovation if it is beyond `CLIPPED` and the tests run; else `begin`.
