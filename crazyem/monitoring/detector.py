@@ -49,7 +49,9 @@ CLEAR, UNCLEAR = 0.95, 0.2  # probability from which a change is reported; s aft
 RULED_OUT = 0.05  # probability below which a hypothesis is no look-alike
 
 
-def weakened(statistic: NDArray[np.float64], unusual: NDArray[np.float64], noise: NDArray[np.float64]) -> Any:
+def weakened(
+    statistic: NDArray[np.float64], unusual: NDArray[np.float64], noise: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """The statistic of data whose noise is larger by a factor `noise` in variance, while the prior is what it is.
 
     Twice the logarithm of the likelihood ratio at sizes x is (2 S'x - x'Jx) / noise - x' prior x. With the likeliest
@@ -58,7 +60,7 @@ def weakened(statistic: NDArray[np.float64], unusual: NDArray[np.float64], noise
     Args:
         statistic: S' (J + prior)^-1 S. unusual: x' prior x.
     """
-    return statistic**2 / noise / np.maximum(statistic + (noise - 1.0) * unusual, 1e-300)
+    return np.asarray(statistic**2 / noise / np.maximum(statistic + (noise - 1.0) * unusual, 1e-300))
 
 
 class Detector:

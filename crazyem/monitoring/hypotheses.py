@@ -23,7 +23,7 @@ ONCE = (KICK, TURN)
 # flights (benchmarks/monitor) its velocity by 1.5 cm/s, its position by 5 mm. That is 3 to 5 % of a typical change. A
 # report needs eight times the normal size.
 NORMAL_SHARE = 0.01
-# Force of a draught [N]: 0.15 m/s (ISO 7730: 0.1 to 0.2 m/s indoors) on a drag of 7 mN s/m (Foerster 2015: 3 to 9).
+# Force of a draught [N]: 0.15 m/s (ASHRAE: still air is slower) on a drag of 7 mN s/m (Foerster 2015: 3 to 9).
 DRAUGHT = 1e-3
 SCALE_WANDER = 0.02  # of the scale of velocities of an onboard filter in undisturbed flights (benchmarks/monitor)
 

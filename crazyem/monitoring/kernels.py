@@ -10,6 +10,7 @@ import numpy as np
 
 from crazyem.compiled import compiled
 from crazyem.estimation.kernels.algebra import apply
+from crazyem.physics.effects.onboard_estimate import path_step
 
 
 @compiled
@@ -72,10 +73,7 @@ def _filter_errors(path, turned, left, middle, acting, onboard, seconds, later, 
                     path[i, c] = -before[i]
             else:
                 drive = -(middle[i, 0] * acting[a, 0] + middle[i, 1] * acting[a, 1])
-            last_p, last_v = 0.5 * time * time * drive, time * drive
-            p, v = path[i, c] - last_p, path[3 + i, c] - last_v
-            path[i, c] = last_p + decay * (cosine * p + sine * (time * v - p))
-            path[3 + i, c] = last_v + decay * (cosine * v + sine * (v - 2.0 * p / time))
+            path[i, c], path[3 + i, c] = path_step(path[i, c], path[3 + i, c], drive, time, decay, cosine, sine)
             error[i, a], error[3 + i, a] = path[i, c], path[3 + i, c]
             if later[c]:
                 path[i, c] -= now[i] - before[i]

@@ -39,8 +39,8 @@ class NuisanceMemory:
     def sums(self, precision: NDArray[np.float64], scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Score (M,) and information (M, M) of the lasting nuisances, with the others integrated out.
 
-        Scores of innovations that are not white vary
-        by `scale` times more than their information says, so both are divided by it.
+        Scores of innovations that are not white vary by `scale` times more than their information says, so both are
+        divided by it.
 
         Args:
             precision: (M,) of the prior. scale: 1 for white innovations.

@@ -20,7 +20,9 @@ from crazyem.estimation.online import SAME_NODE, STATE_COLUMNS
 Array = NDArray[np.float64]
 
 PHASES = 10  # phases in a period: the firmware's clock has steps of 1 ms
-SLIP = 0.002  # share of predictions that are 1 ms late (docs: firmware_sim.md, prediction_slip)
+# Share of predictions that are 1 ms late, as firmware_sim has it (docs: firmware_sim.md). With a tenth of it, or ten
+# times as much, ages are the same within 0.2 ms.
+SLIP = 0.002
 ANEW = 1e-4  # probability per sample that the phase is any other, as after a restart of the filter
 MEAN_AGE = 0.5 * PERIOD * (1.0 - 1.0 / PHASES)  # s, of the ages 0, 1 ... 9 ms
 LONGEST = 0.08  # s; over a longer gap a state tells nothing of its age

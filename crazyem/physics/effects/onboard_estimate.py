@@ -68,6 +68,19 @@ def attitude_error(situation: Situation, rate_error: NDArray, *, delay: float) -
 
 
 @compiled
+def path_step(p, v, drive, time, decay, cosine, sine):
+    """Errors of position and velocity along an axis after a step, by a mean acceleration `drive` (`path_error`).
+
+    decay, cosine and sine: exp(-x), cos(x), sin(x) of the step x in units of `time` [s].
+    """
+    last_p, last_v = 0.5 * time * time * drive, time * drive
+    p, v = p - last_p, v - last_v
+    return last_p + decay * (cosine * p + sine * (time * v - p)), last_v + decay * (
+        cosine * v + sine * (v - 2.0 * p / time)
+    )
+
+
+@compiled
 def path_errors(gap, broken, drive, time, position, velocity):
     """Errors of position and velocity (n, 3) at every row, from mean accelerations `drive` (n, 3) over the steps that
     end there; 0 where a stretch begins, row 0 as given (`path_error`)."""
@@ -79,10 +92,9 @@ def path_errors(gap, broken, drive, time, position, velocity):
         part = gap[k] / time
         left, cosine, sine = np.exp(-part), np.cos(part), np.sin(part)
         for i in range(3):
-            last_p, last_v = 0.5 * time * time * drive[k, i], time * drive[k, i]
-            p, v = position[k - 1, i] - last_p, velocity[k - 1, i] - last_v
-            position[k, i] = last_p + left * (cosine * p + sine * (time * v - p))
-            velocity[k, i] = last_v + left * (cosine * v + sine * (v - 2.0 * p / time))
+            position[k, i], velocity[k, i] = path_step(
+                position[k - 1, i], velocity[k - 1, i], drive[k, i], time, left, cosine, sine
+            )
 
 
 def path_error(situation: Situation, time_constant: float) -> tuple[NDArray, NDArray]:
